@@ -186,7 +186,8 @@ def _write(out: Path, names: list[str], source: Path | None, motion: Motion, tra
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)
         if "report.html" in names:
-            save_report(folder / "report.html", motion, video=source if source and has_images(source) else None)
+            video = source if source and has_images(source) else None
+            save_report(folder / "report.html", motion, video=video, former=out / "report.html")
     if "report.html" not in names:
         (out / "report.html").unlink(missing_ok=True)  # of an older motion
 

@@ -1,4 +1,4 @@
-"""Flexion of knees, hips and elbows: a straight leg or arm has 0 degrees."""
+"""Flexion of knees, hips and elbows: a straight leg or arm has 0 degrees; a thigh behind the trunk less."""
 
 from __future__ import annotations
 
@@ -7,13 +7,8 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.skeleton import indices
 
-#: Ends of the two segments of a joint; a hip's first segment is the trunk.
-_SEGMENTS = {
-    "knee": (("hip", "knee"), ("knee", "ankle")),
-    "hip": (("neck", "pelvis"), ("hip", "knee")),
-    "elbow": (("shoulder", "elbow"), ("elbow", "wrist")),
-}
-_MIDDLE = ("neck", "pelvis")
+#: The three joints of an angle.
+_CHAINS = {"knee": ("hip", "knee", "ankle"), "elbow": ("shoulder", "elbow", "wrist")}
 
 
 def flexion(joints: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -29,16 +24,34 @@ def flexion(joints: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]
     InputError
         When a joint is missing.
     """
-    out = {}
-    for joint, ends in _SEGMENTS.items():
-        sides = []
-        for side in "rl":
-            places = [indices(names, tuple(n if n in _MIDDLE else side + n for n in pair)) for pair in ends]
-            upper, lower = (joints[:, b] - joints[:, a] for a, b in places)
-            across = np.linalg.norm(np.cross(upper, lower), axis=-1)
-            sides.append(np.degrees(np.arctan2(across, (upper * lower).sum(axis=-1))))
-        out[joint] = np.stack(sides, axis=1)
-    return out
+    at = dict(zip(names, np.moveaxis(joints, 1, 0), strict=True))
+    indices(names, ("neck", "pelvis", *(side + name for side in "rl" for name in ("hip", *sum(_CHAINS.values(), ())))))
+    return {"knee": _bend(at, "knee"), "hip": _hips(at), "elbow": _bend(at, "elbow")}
+
+
+def _bend(at: dict[str, np.ndarray], joint: str) -> np.ndarray:
+    sides = []
+    for side in "rl":
+        first, middle, last = (at[side + name] for name in _CHAINS[joint])
+        upper, lower = middle - first, last - middle
+        across = np.linalg.norm(np.cross(upper, lower), axis=-1)
+        sides.append(np.degrees(np.arctan2(across, (upper * lower).sum(axis=-1))))
+    return np.stack(sides, axis=1)
+
+
+def _hips(at: dict[str, np.ndarray]) -> np.ndarray:
+    """Between trunk and thigh, seen from the side: forwards is positive."""
+    trunk = at["neck"] - at["pelvis"]
+    forwards = np.cross(at["lhip"] - at["rhip"], trunk)
+    up = np.cross(forwards, at["lhip"] - at["rhip"])
+    scale = np.linalg.norm(up, axis=-1) / np.maximum(np.linalg.norm(forwards, axis=-1), 1e-12)
+    sides = []
+    for side in "rl":
+        thigh = at[side + "knee"] - at[side + "hip"]
+        ahead = (thigh * forwards).sum(axis=-1) * scale
+        # No thigh points backwards by a right angle: the cut lies there.
+        sides.append(np.degrees((np.arctan2(ahead, -(thigh * up).sum(axis=-1)) + 0.5 * np.pi) % (2 * np.pi)) - 90.0)
+    return np.stack(sides, axis=1)
 
 
 def flexion_words(joints: np.ndarray, names: tuple[str, ...]) -> str:

@@ -39,13 +39,11 @@ class MotionImages:
     frames : index of each image's frame in the motion, increasing
     jpegs : as many JPEG files
     box : x_min, y_min, x_max, y_max px of the crop
-    size : width, height px of the JPEG images
     """
 
     frames: tuple[int, ...]
     jpegs: tuple[bytes, ...]
     box: tuple[int, int, int, int]
-    size: tuple[int, int]
 
 
 def has_images(path: Path) -> bool:
@@ -80,7 +78,7 @@ def read_motion_images(path: Path, motion: Motion) -> MotionImages:
             jpegs.append(encode(image))
     if encode is None:
         raise _no_images(path)
-    return MotionImages(tuple(frames), tuple(jpegs), encode.box, encode.size)
+    return MotionImages(tuple(frames), tuple(jpegs), encode.box)
 
 
 def each_image(path: Path, motion: Motion) -> Iterator[tuple[int, np.ndarray]]:
@@ -229,7 +227,7 @@ class _Encoder:
         self.box = _crop(motion.keypoints, width, height)
         x0, y0, x1, y1 = self.box
         scale = min(1.0, _LONG_SIDE / max(x1 - x0, y1 - y0))
-        self.size = (max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale)))
+        self._size = (max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale)))
         self._share = int(MAX_BYTES * 0.75 / count)
 
     def __call__(self, image: np.ndarray) -> bytes:
@@ -237,11 +235,11 @@ class _Encoder:
         import cv2
 
         x0, y0, x1, y1 = self.box
-        small = cv2.resize(image[y0:y1, x0:x1], self.size, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(image[y0:y1, x0:x1], self._size, interpolation=cv2.INTER_AREA)
         data = b""
         # Quality first, then size.
         for shrink in (1, 2, 4):
-            size = (max(1, self.size[0] // shrink), max(1, self.size[1] // shrink))
+            size = (max(1, self._size[0] // shrink), max(1, self._size[1] // shrink))
             reduced = small if shrink == 1 else cv2.resize(small, size, interpolation=cv2.INTER_AREA)
             for quality in _QUALITIES:
                 data = cv2.imencode(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -15,19 +15,22 @@ from drocap_ros.motion import Motion
 from drocap_ros.report import plots
 from drocap_ros.report.checks import Finding, Severity, run_checks
 from drocap_ros.report.motion_images import MotionImages, read_motion_images
-from drocap_ros.report.page_data import page_data, script_json
+from drocap_ros.report.page_data import images_of_page, page_data, script_json
 from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics, scale_of, stage_seconds
 from drocap_ros.skeleton import side_of
 
-_SCRIPTS = ("data.js", "scene.js", "image.js", "player.js")
+_SCRIPTS = ("data.js", "scene.js", "image.js", "charts.js", "player.js")
 
 
-def save_report(path: str | Path, motion: Motion, *, video: Path | None = None, command: str = "") -> None:
-    """Write the report of a motion.
+def save_report(
+    path: str | Path, motion: Motion, *, video: Path | None = None, former: Path | None = None, command: str = ""
+) -> bool:
+    """Write the report of a motion; returns whether it holds images.
 
     Parameters
     ----------
-    video : source of the motion, for its images; None = 2D keypoints alone
+    video : source of the motion, for its images; None = those of the former report, or 2D keypoints alone
+    former : report whose images are kept where it shows the same keypoints; it may be missing
     command : command line of the report, shown beside the one in the motion's ``meta``
 
     Raises
@@ -36,12 +39,16 @@ def save_report(path: str | Path, motion: Motion, *, video: Path | None = None, 
         When the motion holds no pose or lacks the joints of a torso, or the video cannot be used.
     """
     images = read_motion_images(video, motion) if video is not None else None
+    if images is None and former is not None:
+        images = images_of_page(former, motion)
     Path(path).write_text(render_report(motion, images, command), encoding="utf-8")
+    return images is not None
 
 
 def render_report(motion: Motion, images: MotionImages | None = None, command: str = "") -> str:
     """HTML of the report; see :func:`save_report`."""
     s = motion_statistics(motion)
+    findings = run_checks(motion, s)
     folder = files("drocap_ros.report") / "page"
     page = Template((folder / "page.html").read_text(encoding="utf-8"))
     name = str(motion.meta.get("input", "motion"))
@@ -50,7 +57,8 @@ def render_report(motion: Motion, images: MotionImages | None = None, command: s
         subtitle=escape(_subtitle(motion)),
         style=(folder / "style.css").read_text(encoding="utf-8"),
         tiles="".join(_tile(*tile) for tile in _tiles(motion, s)),
-        checks=_checks(run_checks(motion, s)),
+        badge=_badge(findings),
+        checks=_checks(findings),
         plots="".join(_figure(*figure) for figure in _plots(motion, s)),
         provenance=_provenance(motion, command),
         parameters=escape(json.dumps(motion.meta, indent=1, sort_keys=True)),
@@ -61,8 +69,8 @@ def render_report(motion: Motion, images: MotionImages | None = None, command: s
 
 def _subtitle(motion: Motion) -> str:
     method = motion.meta.get("method", "unknown")
-    frame = "world frame, z up" if motion.frame == "world" else "camera frame"
-    return f"method {method} · {frame}"
+    frame = "in the world, z up" if motion.frame == "world" else "as the camera saw it"
+    return f"3D motion of a person, {frame} · method {method}"
 
 
 def _tile(value: str, unit: str, label: str) -> str:
@@ -86,6 +94,13 @@ def _number(value: float, form: str) -> str:
     return format(value, form) if np.isfinite(value) else "-"
 
 
+def _badge(results: list[Finding]) -> str:
+    titles = [result.title for result in results if result.severity is Severity.WARNING]
+    if not titles:
+        return '<span class="badge">no warnings</span>'
+    return f'<span class="badge warning">{len(titles)} to read below: {escape(", ".join(titles))}</span>'
+
+
 def _checks(results: list[Finding]) -> str:
     items = [(result.severity.value, result.title, result.text) for result in results]
     if not any(result.severity is Severity.WARNING for result in results):
@@ -104,8 +119,7 @@ def _figure(title: str, caption: str, svg: str) -> str:
 def _plots(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
     sides = [side_of(joint, motion.joints) for joint in motion.joints]
     bone_sides = [side_of(bone.split(" - ")[1], motion.joints) for bone in s.bones]
-    seconds = stage_seconds(motion.meta)
-    out = [
+    return [
         (
             "Reprojection error",
             "Distance of the projected 3D joints from the 2D keypoints, RMS over joints.",
@@ -121,6 +135,7 @@ def _plots(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
             "Median, and the range of 90 % of the frames. A bone that changes its length is a sign of depth errors.",
             plots.range_plot(s.bones, 100 * s.bone_lengths_m, unit="cm", classes=bone_sides),
         ),
+        *_time(motion),
         (
             "Confidence per joint",
             "Mean over the frames, 0 to 1.",
@@ -132,10 +147,13 @@ def _plots(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
             plots.bar_plot(motion.joints, s.joint_error_px, form="{:.1f} px", classes=sides),
         ),
     ]
-    if seconds:
-        caption = "Seconds per stage."
-        out.append(("Time", caption, plots.bar_plot(list(seconds), np.array([*seconds.values()]), form="{:.2f} s")))
-    return out
+
+
+def _time(motion: Motion) -> list[tuple[str, str, str]]:
+    if not (seconds := stage_seconds(motion.meta)):
+        return []
+    bars = plots.bar_plot(list(seconds), np.array([*seconds.values()]), form="{:.2f} s")
+    return [("Time", "Seconds per stage of the reconstruction.", bars)]
 
 
 def _provenance(motion: Motion, command: str) -> str:

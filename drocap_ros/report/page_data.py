@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import base64
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 
 from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
 from drocap_ros.report.motion_images import MotionImages
+from drocap_ros.report.movement import Curve, movement
 from drocap_ros.report.statistics import Statistics
 from drocap_ros.skeleton import side_of
 
@@ -20,9 +23,9 @@ def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dic
     """JSON-compatible data: integers, row-major, null where unknown.
 
     ``pose`` mm and ``camera`` (right, forward; thousandths) in axes with z up; ``keypoints`` tenths of a px;
-    ``heading`` milliradians; ``times`` ms.
+    ``heading`` milliradians; ``times`` ms; ``movement`` 1 / ``scale`` of its unit, a list per side.
     """
-    shown = np.arange(0, len(motion.joints3d), -(-len(motion.joints3d) // MAX_POSES))
+    shown = shown_frames(motion)
     axes = upright_camera_rotation(motion)[shown][:, [0, 2]]
     return {
         "joints": list(motion.joints),
@@ -30,13 +33,27 @@ def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dic
         "sides": [side_of(name, motion.joints) for name in motion.joints],
         "world": motion.frame == "world",
         "frames": shown.tolist(),
-        "times": _integers(s.times_s[shown], 1000),
+        "times": _times(motion, shown),
         "pose": _integers(upright_joints(motion)[shown], 1000),
         "camera": _integers(axes, 1000),
         "heading": _integers(s.heading_rad[shown], 1000),
         "keypoints": _integers(motion.keypoints[shown], 10),
+        "movement": [_curve(curve) for curve in movement(motion, s, shown)],
         "series": {"error": _numbers(s.error_px[shown]), "view": _numbers(s.view_deg[shown])},
         "image": None if images is None else _images(images, shown),
+    }
+
+
+def _curve(curve: Curve) -> dict[str, object]:
+    scale = 10 if curve.unit == "°" else 100
+    columns = {"values": curve.values, "deviation": curve.deviation}
+    return {
+        "name": curve.name,
+        "unit": curve.unit,
+        "words": curve.words,
+        "sides": list(curve.sides),
+        "scale": scale,
+        **{key: None if v is None else [_integers(column, scale) for column in v.T] for key, v in columns.items()},
     }
 
 
@@ -56,6 +73,33 @@ def _images(images: MotionImages, shown: np.ndarray) -> dict[str, object]:
         "places": places.tolist(),
         "jpeg": [base64.b64encode(images.jpegs[i]).decode() for i in first],
     }
+
+
+def images_of_page(page: Path, motion: Motion) -> MotionImages | None:
+    """Images that an earlier report of the same keypoints and times holds; None = there is none, or no such report."""
+    try:
+        found = re.search(r'id="motion">(.*?)</script>', page.read_text(encoding="utf-8"), re.DOTALL)
+        data = json.loads(found[1]) if found else {}
+        shown = shown_frames(motion)
+        if data.get("image") is None or data["frames"] != shown.tolist():
+            return None
+        if data["keypoints"] != _integers(motion.keypoints[shown], 10) or data["times"] != _times(motion, shown):
+            return None
+        image = data["image"]
+        jpegs = tuple(base64.b64decode(text) for text in image["jpeg"])
+        x0, y0, x1, y1 = (int(value) for value in image["box"])
+        return MotionImages(tuple(shown[image["places"]].tolist()), jpegs, (x0, y0, x1, y1))
+    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError):  # not a report, or one of old
+        return None
+
+
+def shown_frames(motion: Motion) -> np.ndarray:
+    """Indices of the frames in the page."""
+    return np.arange(0, len(motion.joints3d), -(-len(motion.joints3d) // MAX_POSES))
+
+
+def _times(motion: Motion, shown: np.ndarray) -> list[int | None]:
+    return _integers((motion.stamp_ns[shown] - motion.stamp_ns[0]) * 1e-9, 1000)
 
 
 def _integers(values: np.ndarray, scale: float) -> list[int | None]:

@@ -1,6 +1,7 @@
 """``drocap report`` as a user runs it, and at the end of ``drocap reconstruct``."""
 
 import dataclasses
+import re
 
 import cv2
 import numpy as np
@@ -33,19 +34,50 @@ def test_the_same_motion_gives_the_same_bytes(folder):
     assert texts[0] == texts[1]
 
 
+def write_video(path, motion, rate_hz):
+    width, height = (int(side) + 20 for side in np.nanmax(motion.keypoints, axis=(0, 1)))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate_hz, (width, height))
+    for _ in motion.stamp_ns:
+        writer.write(np.full((height, width, 3), 90, np.uint8))
+    writer.release()
+
+
+def own_rate_hz(motion):
+    return 1e9 / float(np.diff(motion.stamp_ns).mean())
+
+
 def test_images_of_a_video_beside_the_motion_are_shown(person, folder, capsys):
     save_motion(folder / "motion.npz", dataclasses.replace(person, meta={**person.meta, "input": "clip.avi"}))
-    width, height = (int(side) + 20 for side in np.nanmax(person.keypoints, axis=(0, 1)))
-    for rate, shown in ((0.0, False), (24.0, False), (1e9 / float(np.diff(person.stamp_ns).mean()), True)):
-        if rate:
-            codec = cv2.VideoWriter_fourcc(*"MJPG")
-            writer = cv2.VideoWriter(str(folder / "clip.avi"), codec, rate, (width, height))
-            for _ in person.stamp_ns:
-                writer.write(np.full((height, width, 3), 90, np.uint8))
-            writer.release()
+    for rate_hz, shown in ((0.0, False), (24.0, False), (own_rate_hz(person), True)):
+        if rate_hz:
+            write_video(folder / "clip.avi", person, rate_hz)
         assert main(["report", str(folder)]) == 0
-        assert ("--video clip.avi" in capsys.readouterr().out) is not shown
-        assert ('"/9j/' in (folder / "report.html").read_text()) is shown
+        assert ("without images: no video of this motion as" in capsys.readouterr().out) is not shown
+        assert bool(images_in(folder / "report.html")) is shown
+
+
+def test_a_report_keeps_its_images_when_the_video_has_moved(person, folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    save_motion(folder / "motion.npz", dataclasses.replace(person, meta={**person.meta, "input": "clip.avi"}))
+    write_video(folder / "clip.avi", person, own_rate_hz(person))
+    assert main(["report", str(folder)]) == 0
+    pictures = images_in(folder / "report.html")
+    assert len(pictures) == 60
+    (folder / "clip.avi").rename(folder / "elsewhere.avi")
+    capsys.readouterr()
+    assert main(["report", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"kept the images of the report before: no video of this motion as {folder}/clip.avi, ")
+    assert images_in(folder / "report.html") == pictures
+    other = dataclasses.replace(person, keypoints=person.keypoints + 1.0, meta={**person.meta, "input": "clip.avi"})
+    save_motion(folder / "motion.npz", other)
+    assert main(["report", str(folder)]) == 0
+    assert capsys.readouterr().out.startswith("without images")
+    assert images_in(folder / "report.html") == []
+
+
+def images_in(page):
+    return re.findall(r'"(/9j/[^"]*)"', page.read_text())
 
 
 def test_what_cannot_be_shown_is_refused(person, folder, capsys):

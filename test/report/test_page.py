@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
+from drocap_ros.report.flexion import flexion
 from drocap_ros.report.page import render_report
 from drocap_ros.report.page_data import MAX_POSES, script_json
 from drocap_ros.skeleton import BODY_15
@@ -78,6 +79,23 @@ def test_the_data_equal_the_motion(html, person):
     assert data["sides"][BODY_15.index("rwrist")] == "right"
     assert data["sides"][BODY_15.index("lhip")] == "left"
     assert data["sides"][BODY_15.index("head")] == "middle"
+
+
+def test_the_movement_has_a_list_per_side_with_unit_and_scale(html, person):
+    by_name = {curve["name"]: curve for curve in data_of(html)["movement"]}
+    assert {name: curve["unit"] for name, curve in by_name.items()} == {
+        "Knee bend": "°",
+        "Hip bend": "°",
+        "Elbow bend": "°",
+        "Pelvis speed": "m/s",
+        "Wrist speed": "m/s",
+        "Ankle speed": "m/s",
+    }
+    knee = by_name["Knee bend"]
+    expected = flexion(person.joints3d, person.joints)["knee"]
+    np.testing.assert_allclose(np.array(knee["values"]).T / knee["scale"], expected, atol=0.051)
+    assert knee["sides"] == ["right", "left"]
+    assert knee["deviation"] is None  # no covariance
 
 
 def test_checks_commands_and_versions_are_on_the_page(html, person):

@@ -28,7 +28,7 @@ def pages(person, reported_in_camera, one_frame, tmp_path_factory):
     grey = cv2.imencode(".jpg", np.full((200, 150, 3), 90, np.uint8))[1].tobytes()
     low, high = np.nanmin(person.keypoints, axis=(0, 1)), np.nanmax(person.keypoints, axis=(0, 1))
     box = (*(int(v) for v in low - 20), *(int(v) for v in high + 20))
-    images = MotionImages(tuple(range(0, 60, 3)), (grey,) * 20, box, (150, 200))
+    images = MotionImages(tuple(range(0, 60, 3)), (grey,) * 20, box)
     (folder / "images.html").write_text(render_report(person, images), encoding="utf-8")
     joints = person.joints3d.copy()
     joints[10:20] = np.nan
@@ -208,6 +208,44 @@ def test_keypoints_are_drawn_on_their_own_image(browser, pages):
     browser.run('byId("overlay").click()')
     browser.settle()
     assert pixels_of(browser, "image") == with_overlay
+
+
+def test_charts_of_movement_follow_the_player_and_are_chosen(browser, pages):
+    browser.open(pages / "plain.html", 1400, 1000)
+    shown = '[...document.querySelectorAll("#charts figure:not([hidden]) b")].map((b) => b.textContent)'
+    titles = [title for title in browser.run(shown) if title[0].isalpha()]
+    assert titles == ["Knee bend", "Hip bend", "Elbow bend", "Pelvis speed"]
+    x, y = browser.run(
+        """(() => { const wrist = [...byId("choice").children].find((b) => b.textContent === "Wrist speed");
+        const { x, y, width, height } = wrist.getBoundingClientRect(); return [x + width / 2, y + height / 2]; })()"""
+    )
+    browser.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
+    browser.mouse("mouseReleased", x, y, button="left", clickCount=1)
+    browser.settle()
+    assert "Wrist speed" in browser.run(shown)
+    # The cursor stands where the frame is, and its dots have the values of the data.
+    cursor = 'Number(document.querySelector("#charts .cursor").getAttribute("x1"))'
+    places = []
+    for frame in (0, 30, 59):
+        browser.run(f"show({frame})")
+        browser.settle()
+        places.append(browser.run(cursor))
+        said = browser.run('document.querySelector("#charts output .right b").textContent')
+        assert said == f"{browser.run(f'(motion.movement[0].values[0][{frame}] / 10).toFixed(0)')}°"
+    assert places[1] == pytest.approx(places[0] + 30 / 59 * (places[2] - places[0]), abs=0.2)
+    chart = browser.run(
+        """(() => { const b = document.querySelector("#charts svg").getBoundingClientRect(); return [b.x, b.y]; })()"""
+    )
+    x = chart[0] + places[1]
+    browser.mouse("mousePressed", x, chart[1] + 40, button="left", buttons=1, clickCount=1)
+    browser.mouse("mouseReleased", x, chart[1] + 40, button="left", clickCount=1)
+    browser.settle()
+    assert browser.run("state.frame") in (29, 30)
+    browser.run('byId("span").value = "1"; byId("span").dispatchEvent(new Event("change"))')
+    browser.settle()
+    width = browser.run('document.querySelector("#charts svg").clientWidth')
+    assert browser.run(cursor) == pytest.approx(36 + (width - 46) / 2, abs=1.0)  # it stands, the lines move
+    assert browser.errors == []
 
 
 def test_dark_and_light_differ(browser, pages):

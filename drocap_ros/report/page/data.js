@@ -1,9 +1,11 @@
 "use strict";
 // The motion of the page: typed arrays in metres, seconds, radians and pixels, axes with z up.
 
+const byId = (id) => document.getElementById(id);
+const numbers = (list, unit) => Float32Array.from(list, (v) => (v === null ? NaN : v / unit));
+
 const motion = (() => {
-  const raw = JSON.parse(document.getElementById("motion").textContent);
-  const numbers = (list, unit) => Float32Array.from(list, (v) => (v === null ? NaN : v / unit));
+  const raw = JSON.parse(byId("motion").textContent);
   return {
     ...raw,
     count: raw.frames.length,

@@ -1,6 +1,6 @@
 // Time, views and controls.
 
-const byId = (id) => document.getElementById(id);
+let pending = 0;
 const state = { frame: 0, playing: false, speed: 1, overlay: true, view: "novel", colours: palette(), zoom: 1 };
 const turned = { azimuth: motion.heading[0] + 0.75, elevation: 0.3 };
 const ELEVATION = 0.09;
@@ -26,9 +26,9 @@ function draw() {
   byId("scrub").value = frame;
   byId("clock").textContent = `${motion.times[frame].toFixed(2)} s · frame ${motion.frames[frame]}`;
   for (const plot of plots) plot.move(frame);
+  charts.move(frame);
 }
 
-let pending = 0;
 function redraw() {
   if (!pending) pending = requestAnimationFrame(() => { pending = 0; draw(); });
 }
@@ -183,7 +183,7 @@ function listen() {
 
 listen();
 if (!images) {
-  byId("image-tag").textContent = "2D keypoints";
+  byId("image-tag").textContent = "Body as found in the video";
   byId("overlay").closest("label").hidden = true;
 }
 setView("novel");

@@ -1,0 +1,132 @@
+"""Joint angles and speeds over time for people who move: how a knee bends, how fast a hand is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.motion import Motion, upright_joints
+from drocap_ros.report.flexion import flexion
+from drocap_ros.report.statistics import Statistics
+
+#: Half the time of a speed's mean, s: at walking a hand or foot hardly turns in it, and noise of one image is halved.
+_HALF_S = 0.1
+#: Step of numerical derivatives, m: small beside a bone, large beside the rounding of doubles.
+_STEP_M = 1e-4
+_ANGLES = {
+    "knee": "0° is a straight leg.",
+    "hip": "Thigh against the trunk, seen from the side: 0° is standing, forwards is positive.",
+    "elbow": "0° is a straight arm.",
+}
+_BOTH = ("right", "left")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One chart: a quantity of both sides or of the middle, at the frames asked for.
+
+    name, unit, words : title, unit of the values, one sentence on how to read it
+    sides : N of "right", "left", "middle"
+    values : (F, N), NaN where unknown
+    deviation : (F, N) standard deviation of the values, by the motion's covariances; None = not known
+    """
+
+    name: str
+    unit: str
+    words: str
+    sides: tuple[str, ...]
+    values: np.ndarray
+    deviation: np.ndarray | None = None
+
+
+def movement(motion: Motion, s: Statistics, frames: np.ndarray) -> list[Curve]:
+    """Bends of knees, hips and elbows, speeds of pelvis, wrists and ankles, at frames (N,) by index.
+
+    What the motion has no joints for is left out.  Frames without the person are unknown, as their poses are
+    interpolated.
+    """
+    curves = [*_angles(motion, frames), *_speeds(motion, s, frames)]
+    if s.seen.any():
+        for curve in curves:
+            curve.values[~s.seen[frames]] = np.nan
+    return curves
+
+
+def _angles(motion: Motion, frames: np.ndarray) -> Iterator[Curve]:
+    joints = upright_joints(motion)[frames]
+    try:
+        angles = flexion(joints, motion.joints)
+    except InputError:
+        return
+    covariance = _about_pelvis(motion, frames)
+    deviations = {} if covariance is None else _deviations(joints, motion.joints, covariance)
+    for joint, words in _ANGLES.items():
+        yield Curve(f"{joint.capitalize()} bend", "°", words, _BOTH, angles[joint], deviations.get(joint))
+
+
+def _about_pelvis(motion: Motion, frames: np.ndarray) -> np.ndarray | None:
+    """(F, P, 3, 3) m^2 of joints about the pelvis: an error that all joints share turns no limb."""
+    if motion.covariance is None or "pelvis" not in motion.joints:
+        return None
+    covariance = unpack_covariance(motion.covariance[frames])
+    if motion.meta.get("covariance_about") == "pelvis":
+        return covariance
+    relative = np.nan_to_num(covariance - covariance[:, [motion.joints.index("pelvis")]])
+    variances, axes = np.linalg.eigh(relative)
+    return np.asarray((axes * np.maximum(variances, 0.0)[..., None, :]) @ np.swapaxes(axes, -1, -2))
+
+
+def _deviations(joints: np.ndarray, names: tuple[str, ...], covariance: np.ndarray) -> dict[str, np.ndarray]:
+    """Joint -> (F, 2) deg, to first order, the errors of joints independent."""
+    at = flexion(joints, names)
+    variance = {joint: np.zeros_like(angle) for joint, angle in at.items()}
+    for place in range(len(names)):
+        slopes = []
+        for axis in range(3):
+            moved = joints.copy()
+            moved[:, place, axis] += _STEP_M
+            slopes.append({joint: (angle - at[joint]) / _STEP_M for joint, angle in flexion(moved, names).items()})
+        for joint in variance:
+            slope = np.stack([by_axis[joint] for by_axis in slopes], axis=-1)
+            variance[joint] += np.einsum("fsi,fij,fsj->fs", slope, covariance[:, place], slope)
+    return {joint: np.sqrt(value) for joint, value in variance.items()}
+
+
+def _speeds(motion: Motion, s: Statistics, frames: np.ndarray) -> Iterator[Curve]:
+    if len(motion.stamp_ns) < 3:
+        return
+    joints = upright_joints(motion)
+    pelvis = joints[:, [motion.joints.index("pelvis")]]
+    path_known = motion.frame == "world" and bool(np.ptp(pelvis[np.isfinite(pelvis).all(axis=(1, 2))], axis=0).any())
+    words = "Through the world, mean over 0.2 s."
+    if not path_known:
+        words = "Against the pelvis, whose path is not known, in axes that turn with the body; mean over 0.2 s."
+        joints = _facing(joints - pelvis, s.heading_rad)
+    if path_known:
+        yield Curve("Pelvis speed", "m/s", words, ("middle",), _speed(pelvis, s.times_s, frames))
+    for joint in ("wrist", "ankle"):
+        ends = [side + joint for side in "rl"]
+        if set(ends) <= set(motion.joints):
+            both = joints[:, [motion.joints.index(end) for end in ends]]
+            yield Curve(f"{joint.capitalize()} speed", "m/s", words, _BOTH, _speed(both, s.times_s, frames))
+
+
+def _facing(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """(F, P, 3) in axes turned about the vertical by the heading (F,) rad."""
+    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    x, y, z = np.moveaxis(joints, -1, 0)
+    return np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
+
+
+def _speed(joints: np.ndarray, times_s: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """(N, P) m/s at frames (N,): length of the slope of the line through the places (F, P, 3) around each."""
+    half = max(1, round(_HALF_S / float(np.median(np.diff(times_s)))))
+    half = min(half, (len(times_s) - 1) // 2)
+    window = np.clip(frames - half, 0, len(times_s) - 1 - 2 * half)[:, None] + np.arange(2 * half + 1)
+    since = times_s[window] - times_s[window].mean(axis=1, keepdims=True)
+    slope = np.einsum("nw,nwpi->npi", since, joints[window]) / np.square(since).sum(axis=1)[:, None, None]
+    return np.asarray(np.linalg.norm(slope, axis=-1))
