@@ -49,6 +49,7 @@ class Selection:
     topic : of the images of a recording; empty: colour before grey, then that with most messages
     rate_hz : true rate of the images where a video plays them slower
     evidence : file of 3D poses of its images by another system
+    threads : that share the work on the images; the result is the same with any number
     """
 
     clip: Clip = field(default_factory=Clip)
@@ -57,6 +58,7 @@ class Selection:
     topic: str = ""
     rate_hz: float | None = None
     evidence: Path | None = None
+    threads: int = field(default=2, compare=False)
 
 
 _WHOLE, _FOUND = Selection(), Telemetry()
@@ -242,7 +244,7 @@ def _track(
             meter(frame, observation)
             together += in_view(estimator.tracker.persons, frame.stamp_ns) > 1
 
-        observations = observe(clip.select(images.frames), estimator, on_frame, begin_ns)
+        observations = observe(clip.select(images.frames), estimator, on_frame, begin_ns, selection.threads)
     try:
         tracks = tracks_from_observations(observations)
     except InputError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 _NAMESPACE = re.compile(r"/|/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 #: Every random generator takes it.
 _LARGEST_SEED = 2**32 - 1
-
+_MOST_THREADS = 256  # as of the networks' own parameter
 
 #: Where a command adds its parser.
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -97,6 +98,19 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fetch", action="store_true", help="download the default networks first where the folder of models has none"
     )
+
+
+def add_threads_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--threads``."""
+    words = "threads that share the work on the images; the results are the same (default: 2, or 1 on one processor)"
+    parser.add_argument("--threads", metavar="N", type=threads, default=min(2, os.cpu_count() or 1), help=words)
+
+
+def threads(text: str) -> int:
+    """Type of ``--threads``."""
+    if not text.isdecimal() or not 1 <= int(text) <= _MOST_THREADS:
+        raise argparse.ArgumentTypeError(f"expected 1 to {_MOST_THREADS} threads, got {text}")
+    return int(text)
 
 
 def add_seed_option(parser: argparse.ArgumentParser, help: str, metavar: str | None = None) -> None:

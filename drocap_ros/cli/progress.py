@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -12,8 +12,11 @@ if TYPE_CHECKING:
 
 
 @contextlib.contextmanager
-def progress_bars(quiet: bool = False) -> Iterator[Progress]:
-    """A callback that draws one bar per stage on stderr while the context lasts."""
+def progress_bars(quiet: bool = False, shares: Mapping[str, float] | None = None) -> Iterator[Progress]:
+    """A callback that draws one bar per stage on stderr while the context lasts.
+
+    shares : of the time that stages take, in their order: they have one bar together
+    """
     if quiet or not sys.stderr.isatty():
         yield lambda _stage, _done: None
         return
@@ -25,10 +28,16 @@ def progress_bars(quiet: bool = False) -> Iterator[Progress]:
     times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with Bars(*columns, *times, console=Console(stderr=True)) as bars:
         tasks: dict[str, TaskID] = {}
+        names = list(shares or {})
 
         def show(stage: str, done: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=done, total=None if done < 0 else 1.0)
+            key, total = stage, None if done < 0 else 1.0
+            if shares and stage in shares:
+                before = sum(shares[name] for name in names[: names.index(stage)])
+                key, done = "", before + shares[stage] * max(done, 0.0)
+                total = None if total is None else sum(shares.values())
+            if key not in tasks:
+                tasks[key] = bars.add_task(stage, total=1.0)
+            bars.update(tasks[key], description=stage, completed=done, total=total)
 
         yield show

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from drocap_ros.cli.options import (
     add_config_option,
     add_network_options,
     add_quiet_option,
+    add_threads_option,
     clip_of,
 )
 from drocap_ros.errors import DrocapError, InputError
@@ -45,6 +47,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_clip_options(parser)
     add_network_options(parser)
+    add_threads_option(parser)
     parser.add_argument("--wait", action="store_true", help="track no other person after the subject is lost")
     parser.add_argument("--overlay", action="store_true", help="also write overlay.mp4 with the subject drawn")
     parser.add_argument(
@@ -120,22 +123,25 @@ def _track(
     """Write the tracks of every subject, and the overlay; returns a line about them."""
     from drocap_ros.open_images import open_images
     from drocap_ros.perception.estimator import PoseEstimator
+    from drocap_ros.perception.sources.base import in_order
     from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
     from drocap_ros.pipeline import follow_selected
     from drocap_ros.tracks import save_tracks
 
     settings, begin_ns = follow_selected(args.video, config, models, selection, progress)
     estimator = PoseEstimator(models, settings)
-    with open_images(args.video, config.image_ingest, args.topic) as images:
+    with open_images(args.video, config.image_ingest, args.topic) as images, contextlib.ExitStack() as stack:
         overlay = _OverlayWriter(target / "overlay.mp4", images.rate_hz, args.points) if args.overlay else None
+        draw = stack.enter_context(in_order(overlay.add)) if overlay is not None else None
         meter = selection.clip.meter(progress, "2D pose", images.duration_s)
 
         def on_frame(frame: Frame, observation: PoseObservation) -> None:
             meter(frame, observation)
-            if overlay is not None:
-                overlay.add(frame, observation)
+            if draw is not None:
+                draw(frame, observation)
 
-        observations = observe(selection.clip.select(images.frames), estimator, on_frame, begin_ns)
+        frames = selection.clip.select(images.frames)
+        observations = observe(frames, estimator, on_frame, begin_ns, args.threads)
     if overlay is not None:
         overlay.close()
     tracks_from_observations(observations)  # raises for a recording without a person

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.observation import PoseObservation
-from drocap_ros.perception.background_tracks import BackgroundTracks
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import without_parts
 from drocap_ros.perception.load_models import limited_use, load_detector, load_feet_model, load_pose_model
 from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.tracking.camera_motion import CameraMotion, sweeps
+from drocap_ros.perception.scene import Scene, SceneStep
+from drocap_ros.perception.sources.base import Frame
+from drocap_ros.perception.tracking.camera_motion import sweeps
 from drocap_ros.perception.tracking.other_poses import OtherPoses
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Subject
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
@@ -27,7 +30,6 @@ from drocap_ros.skeleton import BODY_19
 
 _CLEAR_SCORE = 0.6  # detection score from which the next images need no detection, if the pose is clear
 _SLACK_S = 0.005  # tolerance of the detection interval against jitter of the stamps
-_COMPARED_ROWS = 4  # every so many rows tell whether an image is the last one again
 _UNSEEN_NS = 80_000_000  # without detection and believable pose until there are no keypoints: two images at 25 Hz
 _LONGEST_PAUSE = 4  # of the pose network under load shedding, over that after a first failure: 0.4 s at 30 Hz
 
@@ -62,11 +64,16 @@ class PoseEstimator:
         self._body = BodyPoseModel(self.pose_model)
         self._others = OtherPoses(self.tracker, self._body)
         self._flow = KeypointFlow()
-        self._background, self._camera = BackgroundTracks(), CameraMotion()
+        self._scene = Scene()
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="scene")
+        #: The next image and its scene's step, which another thread makes.
+        self._ahead: tuple[Frame, Future[SceneStep]] | None = None
+        #: Boxes of all persons after each of the last two images.
+        self._boxes: deque[list[np.ndarray]] = deque([[], []], maxlen=2)
         self._motion: np.ndarray | None = None
         self._last_ns: int | None = None
-        #: Rows of the last image that certainly showed the subject, and the subject in it.
-        self._repeated: tuple[np.ndarray, PoseObservation] | None = None
+        #: The subject in the last image, if that certainly showed it.
+        self._certain: PoseObservation | None = None
         #: Last run of the detector, and last image in which it, the pose or the optical flow showed the subject.
         self._detected_ns = self._seen_ns = 0
         #: Score of the subject in the last detection, and mean confidence of its last keypoints; 0 = none.
@@ -79,7 +86,12 @@ class PoseEstimator:
         self.keypoints: NetworkKeypoints | None = None
 
     def process(
-        self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None = None, load_level: int = 0
+        self,
+        image: np.ndarray,
+        stamp_ns: int,
+        roi: np.ndarray | None = None,
+        load_level: int = 0,
+        ahead: Frame | None = None,
     ) -> PoseObservation:
         """The subject in one image.
 
@@ -93,6 +105,7 @@ class PoseEstimator:
             an interval of ``load_level * detect_every_s``; after a run of the pose network without a person it pauses
             for ``load_level`` images, doubled at each further failure up to four times that, unless the detection is
             clear
+        ahead : the next image, whose scene another thread follows meanwhile; the results are the same without it
         """
         _check_image(image)
         if self._last_ns is not None and stamp_ns < self._last_ns:
@@ -100,33 +113,33 @@ class PoseEstimator:
             self.tracker.reset()
             self._flow.start(None, None)
             self._others = OtherPoses(self.tracker, self._body)
-            self._background.reset()
-            self._camera.reset()
-            self._margins, self._repeated, self._seen_ns = None, None, 0
+            self._margins, self._certain, self._seen_ns = None, None, 0
         self._last_ns = stamp_ns
         roi = _validated_roi(roi)
+        scene = self._scene_of(image, stamp_ns, ahead)
         # A camera that repeats its picture shows nothing new: the bridge knows that by the same keypoints, bit for bit.
-        rows = image[::_COMPARED_ROWS]
-        if self._repeated is not None and roi is None and np.array_equal(rows, self._repeated[0]):
-            return dataclasses.replace(self._repeated[1], stamp_ns=stamp_ns)
-        self._follow_background(image)
-        observation, certain = self._observe(image, stamp_ns, roi, load_level)
-        self._repeated = (rows.copy(), observation) if certain else None
-        points = self._background.renew([person.box for person in self.tracker.persons], stamp_ns)
-        return dataclasses.replace(observation, background=points)
-
-    def _follow_background(self, image: np.ndarray) -> None:
-        """Follow the scene's fixed points, and let all persons follow the camera's motion."""
-        last = self._background.points
-        now = self._background.follow(image)
-        if self.tracker.persons:
-            self._motion = self._camera.update(last, now, _size(image))
+        if scene.points is None and self._certain is not None and roi is None:
+            observation = dataclasses.replace(self._certain, stamp_ns=stamp_ns)
         else:
-            self._camera.reset()
-            self._motion = None
-        if self._motion is not None:
-            self.tracker.move_camera(self._motion)
-            self._others.move_camera(self._motion)
+            self._motion = scene.motion if self.tracker.persons else None
+            if self._motion is not None:
+                self.tracker.move_camera(self._motion)
+                self._others.move_camera(self._motion)
+            observation, certain = self._observe(image, stamp_ns, roi, load_level)
+            self._certain = observation if certain else None
+        self._boxes.append([person.box.copy() for person in self.tracker.persons])
+        return dataclasses.replace(observation, background=scene.points)
+
+    def _scene_of(self, image: np.ndarray, stamp_ns: int, ahead: Frame | None) -> SceneStep:
+        """The scene in this image; that in the next one is begun."""
+        begun, self._ahead = self._ahead, None
+        scene = None if begun is None else begun[1].result()
+        if scene is None or begun is None or begun[0].image is not image:
+            scene = self._scene.step(image, stamp_ns, self._boxes[0])
+        if ahead is not None:
+            step = self._beside.submit(self._scene.step, ahead.image, ahead.stamp_ns, self._boxes[1])
+            self._ahead = ahead, step
+        return scene
 
     def _observe(
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, load_level: int

@@ -14,7 +14,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.sources.base import Frame, prefetch
+from drocap_ros.perception.sources.base import Frame, prefetch, with_next
 from drocap_ros.tracks import Tracks
 
 
@@ -23,8 +23,12 @@ def observe(
     estimator: PoseEstimator,
     on_frame: Callable[[Frame, PoseObservation], None] | None = None,
     begin_ns: int | None = None,
+    threads: int = 2,
 ) -> list[PoseObservation]:
-    """Observations of all frames; a second thread decodes ahead.
+    """Observations of all frames: the same, bit for bit, with any number of threads.
+
+    With two or more, one decodes ahead and one follows the scene of the next image, while this one searches for the
+    subject: each of them needs its own result of the last image.
 
     Parameters
     ----------
@@ -32,13 +36,15 @@ def observe(
     estimator : a fresh one; it keeps its subject between calls
     on_frame : called with each frame and its observation, for progress and overlays
     begin_ns : frames before it are observations without a subject
+    threads : 1 = this one does everything
     """
+    beside = threads > 1
     observations = []
-    for frame in prefetch(frames):
+    for frame, ahead in with_next(prefetch(frames) if beside else frames):
         if begin_ns is not None and frame.stamp_ns < begin_ns:
             observation = PoseObservation(frame.stamp_ns, 0, (frame.image.shape[1], frame.image.shape[0]))
         else:
-            observation = estimator.process(frame.image, frame.stamp_ns)
+            observation = estimator.process(frame.image, frame.stamp_ns, ahead=ahead if beside else None)
         observations.append(observation)
         if on_frame is not None:
             on_frame(frame, observation)

@@ -9,11 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from drocap_ros.clip import Progress
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.motion import Motion
 from drocap_ros.open_images import Images, open_images
+from drocap_ros.perception.models.network_input import shrink
 from drocap_ros.perception.sources import Frame
+from drocap_ros.perception.sources.base import prefetch
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 
@@ -22,7 +25,8 @@ MAX_IMAGES = 300
 MAX_BYTES = 8_000_000  # bytes; mail often ends at 10 MB
 #: Longer side of an image in the page, px.
 _LONG_SIDE = 640
-_QUALITIES = (75, 60, 45, 30)
+#: How an image is compressed, the best first: at a share of that size and a quality.
+_STEPS = tuple((share, quality) for share in (1, 2, 4) for quality in (75, 60, 45, 30))
 #: Margin of the crop, as a share of its size.
 _MARGIN = 0.12
 #: Tolerances of the checks whether images belong to a motion: their number (re-encoding loses a few), their rate, and
@@ -56,7 +60,7 @@ def has_images(path: Path) -> bool:
         return bool(session.topics_of(IMAGE, COMPRESSED_IMAGE))
 
 
-def read_motion_images(path: Path, motion: Motion) -> MotionImages:
+def read_motion_images(path: Path, motion: Motion, progress: Progress | None = None) -> MotionImages:
     """Images of a motion out of its video, folder or recording.
 
     Frames are matched by their stamps; without a common clock both start with their first frame.
@@ -76,6 +80,8 @@ def read_motion_images(path: Path, motion: Motion) -> MotionImages:
             encode = encode or _Encoder(motion, image.shape, len(wanted))
             frames.append(index)
             jpegs.append(encode(image))
+            if progress is not None:
+                progress("report", (index + 1) / len(motion.stamp_ns))
     if encode is None:
         raise _no_images(path)
     return MotionImages(tuple(frames), tuple(jpegs), encode.box)
@@ -111,7 +117,8 @@ def _opened(path: Path, motion: Motion) -> Iterator[Images]:
     with open_images(path, topic=topic) as images:
         if not is_recording(path):  # a recording may hold more images than poses, with the same clock
             _check_times(path, images, motion)
-        yield images._replace(frames=_checked_sizes(path, images.frames, motion))
+        with contextlib.closing(prefetch(images.frames)) as frames:
+            yield images._replace(frames=_checked_sizes(path, frames, motion))
 
 
 def _check_times(path: Path, images: Images, motion: Motion) -> None:
@@ -228,24 +235,31 @@ class _Encoder:
         x0, y0, x1, y1 = self.box
         scale = min(1.0, _LONG_SIDE / max(x1 - x0, y1 - y0))
         self._size = (max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale)))
-        self._share = int(MAX_BYTES * 0.75 / count)
+        self._most = int(MAX_BYTES * 0.75 / count)
+        self._step = 0  # of the last image: the next one takes hardly more or fewer bytes
 
     def __call__(self, image: np.ndarray) -> bytes:
-        """JPEG of an image (H, W, 3) uint8 BGR."""
+        """JPEG of an image (H, W, 3) uint8 BGR: of the best step that fits."""
+        x0, y0, x1, y1 = self.box
+        small = shrink(image[y0:y1, x0:x1], self._size)
+        data = self._compressed(small, self._step)
+        while len(data) <= self._most and self._step:
+            if len(better := self._compressed(small, self._step - 1)) > self._most:
+                break
+            data, self._step = better, self._step - 1
+        while len(data) > self._most and self._step < len(_STEPS) - 1:
+            self._step += 1
+            data = self._compressed(small, self._step)
+        return data
+
+    def _compressed(self, image: np.ndarray, step: int) -> bytes:
         import cv2
 
-        x0, y0, x1, y1 = self.box
-        small = cv2.resize(image[y0:y1, x0:x1], self._size, interpolation=cv2.INTER_AREA)
-        data = b""
-        # Quality first, then size.
-        for shrink in (1, 2, 4):
-            size = (max(1, self._size[0] // shrink), max(1, self._size[1] // shrink))
-            reduced = small if shrink == 1 else cv2.resize(small, size, interpolation=cv2.INTER_AREA)
-            for quality in _QUALITIES:
-                data = cv2.imencode(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-                if len(data) <= self._share:
-                    return data
-        return data
+        share, quality = _STEPS[step]
+        reduced = (
+            image if share == 1 else shrink(image, (max(1, self._size[0] // share), max(1, self._size[1] // share)))
+        )
+        return cv2.imencode(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def _crop(keypoints: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:

@@ -11,6 +11,7 @@ from string import Template
 
 import numpy as np
 
+from drocap_ros.clip import Progress
 from drocap_ros.motion import Motion
 from drocap_ros.report import plots
 from drocap_ros.report.checks import Finding, Severity, run_checks
@@ -23,7 +24,13 @@ _SCRIPTS = ("data.js", "scene.js", "image.js", "charts.js", "player.js")
 
 
 def save_report(
-    path: str | Path, motion: Motion, *, video: Path | None = None, former: Path | None = None, command: str = ""
+    path: str | Path,
+    motion: Motion,
+    *,
+    video: Path | None = None,
+    former: Path | None = None,
+    command: str = "",
+    progress: Progress | None = None,
 ) -> bool:
     """Write the report of a motion; returns whether it holds images.
 
@@ -32,13 +39,14 @@ def save_report(
     video : source of the motion, for its images; None = those of the former report, or 2D keypoints alone
     former : report whose images are kept where it shows the same keypoints; it may be missing
     command : command line of the report, shown beside the one in the motion's ``meta``
+    progress : called with the stage "report" and its completed share
 
     Raises
     ------
     InputError
         When the motion holds no pose or lacks the joints of a torso, or the video cannot be used.
     """
-    images = read_motion_images(video, motion) if video is not None else None
+    images = read_motion_images(video, motion, progress) if video is not None else None
     if images is None and former is not None:
         images = images_of_page(former, motion)
     Path(path).write_text(render_report(motion, images, command), encoding="utf-8")

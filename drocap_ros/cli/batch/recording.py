@@ -130,7 +130,7 @@ def _reconstruct(task: Task, begin: float) -> Record:
     if (folder / RECORD_FILE).is_file():
         return {**json.loads((folder / RECORD_FILE).read_text(encoding="utf-8")), **task.record}
     with output_folder(folder) as work:
-        own = {"out": work, "quiet": True, "command_line": task.command}
+        own = {"out": work, "quiet": True, "command_line": task.command, "threads": 2}
         with _warnings() as warnings:
             reconstruct.run(argparse.Namespace(**{**vars(task.arguments), **own}))
         figures = quality(load_motion(work / "motion.npz"))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import Enum
@@ -102,3 +103,35 @@ def prefetch(frames: Iterable[Frame], ahead: int = 4) -> Generator[Frame, None, 
     finally:
         # A file must not be closed during a read; the read of a live source ends only by its closing.
         pool.shutdown(wait=not getattr(frames, "live", False), cancel_futures=True)
+
+
+def with_next(frames: Iterable[Frame]) -> Iterator[tuple[Frame, Frame | None]]:
+    """Each frame with the one after it; None after the last one."""
+    last: Frame | None = None
+    for frame in frames:
+        if last is not None:
+            yield last, frame
+        last = frame
+    if last is not None:
+        yield last, None
+
+
+@contextlib.contextmanager
+def in_order(call: Callable[..., None], waiting: int = 4) -> Iterator[Callable[..., None]]:
+    """A function that hands its arguments to ``call`` in another thread, in order.
+
+    waiting : most calls that wait for that thread; a further one waits for the first of them
+
+    An error of a call is raised by a later one, or at the end.
+    """
+    pending: deque[Future[None]] = deque()
+
+    def submit(*arguments: object) -> None:
+        if len(pending) >= waiting:
+            pending.popleft().result()
+        pending.append(pool.submit(call, *arguments))
+
+    with ThreadPoolExecutor(1, thread_name_prefix="in_order") as pool:
+        yield submit
+        for done in pending:
+            done.result()

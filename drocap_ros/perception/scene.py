@@ -1,0 +1,59 @@
+"""Fixed points of the scene and the camera's motion by them: a step of an image that may run beside the last one's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.background import FixedPoints
+from drocap_ros.perception.background_tracks import BackgroundTracks
+from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box
+
+_COMPARED_ROWS = 4  # every so many rows tell whether an image is the last one again
+
+
+class SceneStep(NamedTuple):
+    """The scene in one image.
+
+    points : fixed points, without those on persons; None in an image that is the last one again: points that stand
+        still would say that the camera does
+    motion : (2, 3) of the image by the camera's since the last one; None where it is small or unknown
+    """
+
+    points: FixedPoints | None
+    motion: np.ndarray | None
+
+
+class Scene:
+    """Follows the scene through images; equal images and boxes give equal steps."""
+
+    def __init__(self) -> None:
+        self._background, self._camera = BackgroundTracks(), CameraMotion()
+        self._rows: np.ndarray | None = None
+        self._last_ns = 0
+        self._motion: np.ndarray | None = None
+
+    def step(self, image: np.ndarray, stamp_ns: int, persons: Sequence[np.ndarray]) -> SceneStep:
+        """The scene in the next image (H, W, 3) uint8 BGR; a stamp before the last one begins anew.
+
+        persons : boxes (4,) px of two images ago, so that this image need not wait for the last one's persons
+        """
+        rows = image[::_COMPARED_ROWS]
+        if self._rows is not None and stamp_ns >= self._last_ns and np.array_equal(rows, self._rows):
+            self._last_ns, self._motion = stamp_ns, None
+            return SceneStep(None, None)
+        if stamp_ns < self._last_ns:
+            self._background.reset()
+            self._camera.reset()
+            self._motion = None
+        self._rows, self._last_ns = rows.copy(), stamp_ns
+        last = self._background.points
+        now = self._background.follow(image)
+        before, self._motion = self._motion, self._camera.update(last, now, (image.shape[1], image.shape[0]))
+        boxes = list(persons)
+        for motion in (before, self._motion):
+            if motion is not None:
+                boxes = [moved_box(motion, box) for box in boxes]
+        return SceneStep(self._background.renew(boxes, stamp_ns), self._motion)

@@ -1,0 +1,81 @@
+"""The steps of an image beside each other: the same observations with any number of threads."""
+
+import numpy as np
+import pytest
+from rendered_person import rendered_images
+
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.load_models import SIMULATION, models_folder
+from drocap_ros.perception.scene import Scene
+from drocap_ros.perception.sources.base import Frame, in_order
+from drocap_ros.perception.track_video import observe
+
+pytest.importorskip("onnxruntime")
+
+STEP_NS = 33_333_333
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """A moving person; one picture comes twice, and the stamps go back once."""
+    images = rendered_images(20)
+    images.insert(8, images[7].copy())
+    stamps = [*range(15), *range(3, 9)]
+    return [Frame(stamp * STEP_NS, image) for stamp, image in zip(stamps, images, strict=True)]
+
+
+def test_observations_are_the_same_bit_for_bit_with_one_thread_and_with_more(frames):
+    one, more = (observe(iter(frames), PoseEstimator(models_folder(SIMULATION)), threads=threads) for threads in (1, 3))
+    assert any(np.isfinite(seen.keypoints).any() for seen in one)
+    for a, b in zip(one, more, strict=True):
+        assert (a.track_id, a.background is None) == (b.track_id, b.background is None)
+        for name in ("keypoints", "covariance", "confidence", "roi"):
+            assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
+        if a.background is not None:
+            assert np.array_equal(a.background.track, b.background.track)
+            assert np.array_equal(a.background.point, b.background.point)
+
+
+def test_a_step_that_was_begun_for_another_image_is_not_taken(frames):
+    estimator = PoseEstimator(models_folder(SIMULATION))
+    estimator.process(frames[0].image, 0, ahead=frames[5])
+    seen = estimator.process(frames[1].image, STEP_NS)
+    scene = Scene()
+    for frame, stamp_ns in ((frames[0], 0), (frames[5], frames[5].stamp_ns), (frames[1], STEP_NS)):
+        step = scene.step(frame.image, stamp_ns, [])
+    assert len(seen.background) > 10
+    assert np.isin(seen.background.track, step.points.track).all()
+
+
+def test_points_on_a_person_end_where_the_camera_has_moved_them(frames):
+    scene = Scene()
+    image = frames[0].image
+    first = scene.step(image, 0, []).points
+    middle = np.median(first.point, axis=0)
+    box = np.concatenate([middle - 150.0, middle + 150.0])
+    inside = ((first.point > box[:2]) & (first.point < box[2:])).all(axis=1)
+    assert inside.sum() > 3
+    moved = np.roll(image, 30, axis=1)
+    step = scene.step(moved, STEP_NS, [box])
+    assert step.motion is not None
+    place = step.points.point - [30.0, 0.0]
+    on_it = ((place > box[:2]) & (place < box[2:])).all(axis=1)
+    assert not on_it.any()
+
+
+def test_calls_in_order_raise_their_errors():
+    seen = []
+
+    def call(number):
+        if number == 2:
+            raise ValueError("two")
+        seen.append(number)
+
+    def submit_all():
+        with in_order(call, waiting=2) as submit:
+            for number in range(5):
+                submit(number)
+
+    with pytest.raises(ValueError, match="two"):
+        submit_all()
+    assert seen[:2] == [0, 1]
