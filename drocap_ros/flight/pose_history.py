@@ -30,12 +30,11 @@ class PoseHistory:
     Parameters
     ----------
     keep_s : how far back
-    extrapolate_s : longest extrapolation beyond the newest state
     """
 
-    def __init__(self, keep_s: float = 3.0, extrapolate_s: float = 0.15) -> None:
-        self._keep_ns, self._extrapolate_ns = int(keep_s * NS), int(extrapolate_s * NS)
-        self._poses: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = deque()
+    def __init__(self, keep_s: float = 3.0) -> None:
+        self._keep_ns = int(keep_s * NS)
+        self._poses: deque[tuple[int, np.ndarray, np.ndarray]] = deque()
         #: (3,) m, reported minus filtered position now: add it to a position from here.
         self.offset: np.ndarray = np.zeros(3)
 
@@ -50,28 +49,23 @@ class PoseHistory:
         if self._poses and state.stamp_ns <= self._poses[-1][0]:
             self._poses.clear()
         self.offset = state.position_enu_m - place
-        self._poses.append((state.stamp_ns, camera, place, np.nan_to_num(state.velocity_enu_m_s)))
+        self._poses.append((state.stamp_ns, camera, place))
         while state.stamp_ns - self._poses[0][0] > self._keep_ns:
             self._poses.popleft()
 
+    def reached(self, stamp_ns: int) -> bool:
+        """Whether a state of this instant or a later one is known."""
+        return bool(self._poses) and stamp_ns <= self._poses[-1][0]
+
     def at(self, stamp_ns: int) -> CameraPose | None:
         """Pose at an instant; None outside the states."""
-        if not self._poses or stamp_ns < self._poses[0][0] - self._extrapolate_ns:
+        if not self.reached(stamp_ns) or stamp_ns < self._poses[0][0]:
             return None
-        newest = self._poses[-1]
-        if stamp_ns >= newest[0]:
-            gap_ns = stamp_ns - newest[0]
-            if gap_ns > self._extrapolate_ns:
-                return None
-            before = self._poses[-2] if len(self._poses) > 1 else newest
-            step = newest[0] - before[0]
-            camera = slerp(before[1], newest[1], 1.0 + min(gap_ns / step, 3.0)) if step > 0 else newest[1]
-            return CameraPose(camera_rotation(camera), newest[2] + newest[3] * gap_ns / NS)
-        later = newest
+        later = self._poses[-1]
         for pose in reversed(self._poses):
             if pose[0] <= stamp_ns:
-                part = (stamp_ns - pose[0]) / (later[0] - pose[0])
+                part = (stamp_ns - pose[0]) / max(later[0] - pose[0], 1)
                 position = (1 - part) * pose[2] + part * later[2]
                 return CameraPose(camera_rotation(slerp(pose[1], later[1], part)), position)
             later = pose
-        return CameraPose(camera_rotation(later[1]), later[2])
+        return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from drocap_ros.stamps import NS
 
 _CLOCK_JUMP_S = 0.25  # between the clock of the stamps and the monotonic one: a subject's age would be wrong by it
 _MAX_EXTRAPOLATION_S = 0.3  # of a position by its velocity
+_WAITING = 16  # pictures that wait for the camera's attitude: half a second at 30 Hz, older than any that is flown by
 #: MAV_TYPE of the vehicles for which the control was made: multirotors, and a helicopter under the same autopilot.
 _MULTIROTORS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 _STATUS_MESSAGES = (("GPS_RAW_INT",), ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), ("SYS_STATUS",))
@@ -66,6 +68,7 @@ class Observer:
         self._history, self._pictures = PoseHistory(), PictureWatch()
         self._subject, self._guard = SubjectFilter(config), Guard(config)
         self._following, self._keeping = Following(config.max_echo_age_s), Keeping(config)
+        self._waiting: deque[tuple[PoseObservation, bool]] = deque(maxlen=_WAITING)
         self._before: tuple[int, float] | None = None  # stamp and monotonic time of the last step
         self._camera_changed: Condition | None = None  # since the last step
 
@@ -80,21 +83,36 @@ class Observer:
         self.vehicle = state
         self._history.add(state, self._filter.position)
         self._subject.height_wanders = autopilot_of(state.autopilot).height_wanders
+        self._locate()
 
     def on_camera(self, camera_matrix: np.ndarray) -> None:
         """Take the camera matrix (3, 3) px; raises as :meth:`Framing.calibrate`.  A change ends the motion."""
         self._camera_changed = self.framing.calibrate(camera_matrix) or self._camera_changed
 
     def on_pose2d(self, observation: PoseObservation, *, locked: bool) -> None:
-        """Take the keypoints of one image; ``locked``: the vehicle flies by the present subject."""
+        """Take the keypoints of one image; ``locked``: the vehicle flies by the present subject.
+
+        It waits for a state after its exposure: the attitude of a body that starts or brakes is off by degrees 0.1 s
+        later, whatever its rate was, and the range of the ankles by a metre.
+        """
         stamp_ns = observation.stamp_ns - round(self._config.camera_latency_s * NS)
         observation = dataclasses.replace(observation, stamp_ns=stamp_ns)
         self.framing.size = observation.image_size
-        fresh = self._pictures.take(observation)
-        if (matrix := self.framing.matrix) is not None and self._camera_changed is None and fresh:
-            camera = self._history.at(stamp_ns)
-            self._subject.update(observation, matrix, camera, locked=locked)
-            self._guard.see(observation, matrix, camera, locked=locked)
+        if self._pictures.take(observation):
+            self._waiting.append((observation, locked))
+            self._locate()
+
+    def _locate(self) -> None:
+        """Locate the subject in the pictures whose camera's pose is known by now."""
+        for _ in range(len(self._waiting)):
+            observation, locked = self._waiting.popleft()
+            if not self._history.reached(observation.stamp_ns):
+                self._waiting.append((observation, locked))
+                continue
+            if (matrix := self.framing.matrix) is not None and self._camera_changed is None:
+                camera = self._history.at(observation.stamp_ns)
+                self._subject.update(observation, matrix, camera, locked=locked)
+                self._guard.see(observation, matrix, camera, locked=locked)
 
     def observe(self, link: MavlinkLink, now_ns: int, now_s: float, own: OwnFlight) -> tuple[Observed, float]:
         """The observation of a step, and the time in s since the last one.

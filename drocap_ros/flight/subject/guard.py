@@ -14,7 +14,13 @@ import numpy as np
 
 from drocap_ros.flight.observed import SizeSight
 from drocap_ros.flight.pose_history import CameraPose
-from drocap_ros.flight.subject.subject_measurement import MAX_BENDING, SIZE_NOISE, SubjectMeasurement, locate_subject
+from drocap_ros.flight.subject.subject_measurement import (
+    BENT,
+    MAX_BENDING,
+    SIZE_NOISE,
+    SubjectMeasurement,
+    locate_subject,
+)
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
 from drocap_ros.stamps import NS
@@ -22,7 +28,6 @@ from drocap_ros.stamps import NS
 _BEARING_NOISE = 0.01  # share of the range
 _NOISE_M = 0.04  # of a place, whatever its range
 _ACCELERATION = 0.7  # m/s^2: standard deviation of the change of the subject's velocity in a second
-_BENT = 4.0  # times the noise: a bent body looks smaller, its size counts for less
 _BEARING_GATE = 4.0  # standard deviations across the sight
 _SIZE_GATE = 0.35  # share of the range along it
 _SURE = 0.5  # standard deviations of the speed at which he walks away that are left out
@@ -74,7 +79,7 @@ class Guard:
             return True
         if gap_s <= 0 or other:
             return False
-        sure = self._correct(found.position[:2], camera, gap_s, 1.0 if found.bending < MAX_BENDING else _BENT)
+        sure = self._correct(found.position[:2], camera, gap_s, 1.0 if found.bending < MAX_BENDING else BENT)
         self._learn_away(camera, gap_s)
         return sure
 

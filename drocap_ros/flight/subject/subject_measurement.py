@@ -43,6 +43,7 @@ _SHALLOW = np.sin(np.deg2rad(4.0))
 _MAX_RANGE_M = 200.0  # a person is less than 10 px high there
 _THIRD_LONGEST = 0.99  # of the true length
 SIZE_NOISE = 0.06  # of one image, share of the range
+BENT = 4.0  # times the noise: a bent body looks smaller, as does a trunk that leans; its size counts for less
 MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
 
 
@@ -74,7 +75,8 @@ class SubjectMeasurement(NamedTuple):
     noise : (3, 3) m^2, independent from image to image
     systematic : (3, 3) m^2, constant: assumed stature, height above ground, attitude
     range_size_m, range_ground_m : horizontal range of each source, NaN without
-    bending : foreshortening of unequal bones, logarithm of a ratio; about 0.1 by noise alone
+    bending : foreshortening of unequal bones, logarithm of a ratio; about 0.1 by noise alone; inf = the trunk alone,
+        of a person whose legs are out of the picture
     nearer : share of the range by which the nearer of the two sources puts the subject nearer; 0 with one source
     """
 
@@ -156,7 +158,8 @@ def locate_subject(
         )
 
     # Feet give a precise range from image to image, bones do not.
-    noise = noise if np.isfinite(noise) else SIZE_NOISE * distance + 0.05
+    if not np.isfinite(noise):
+        noise = (BENT if np.isinf(bending) else 1.0) * SIZE_NOISE * distance + 0.05
     return SubjectMeasurement(
         position, spread(noise, _NOISE.bearing * distance + 0.03), spread(sd, turn), size, ground, bending, nearer
     )
@@ -171,16 +174,18 @@ def _range_from_size(
     does not shorten them.  A wrong joint lengthens two bones at most; the shortest bones are foreshortened.  Without
     shanks the third of three bones is the shortest: then the second longest counts, or the trunk if it is longer.
     Thighs bend towards the camera, and a network that misses shanks of the ground's colour puts the knees too high:
-    both would put the subject much too far away.
+    both would put the subject much too far away.  The trunk counts alone where the picture's border cuts the legs off.
     """
     depth = rays[:, :2] @ ahead
     usable = seen & (depth > 0.05)
     bones = usable[_ENDS_A] & usable[_ENDS_B]
-    if bones.sum() < 3:
+    if bones.sum() < 3 and not bones[0]:
         return float("nan"), float("nan")
     across = np.stack([rays[:, 1] * ahead[0] - rays[:, 0] * ahead[1], rays[:, 2]], axis=1)
     across = across / np.where(usable, depth, 1.0)[:, None]
     lengths = np.linalg.norm(across[_ENDS_A] - across[_ENDS_B], axis=1)[bones] / (_SHARES[bones] * config.body_height_m)
+    if len(lengths) < 3:
+        return 1.0 / max(float(lengths[0]), 1e-6), float("inf")
     order = np.sort(lengths)[::-1]
     length = float(order[2 if len(order) > 4 else 1])
     if len(order) == 3 and bones[0]:  # the trunk

@@ -15,6 +15,7 @@ from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.skeleton import BODY_15
 
 S = 1_000_000_000
 
@@ -124,6 +125,26 @@ def test_missed_shanks_and_knees_too_high_put_nobody_farther(up):
         found = locate_subject(seen, capture.tracks.camera_matrix, pose, SubjectConfig())
         truth = np.linalg.norm(capture.joints3d_world[i, 0, :2] - pose.position[:2])
         assert 0.9 * truth < found.range_size_m < 1.1 * truth
+
+
+@pytest.mark.parametrize("action", ["stand", "walk"])
+def test_one_whose_legs_leave_the_picture_is_still_followed(action):
+    """A fixed camera tilts up as the vehicle gives way to one who comes nearer."""
+    capture, subject, errors, located = flight(action), SubjectFilter(SubjectConfig()), [], []
+    legs = [i for i, name in enumerate(BODY_15.joints) if name[1:] in ("knee", "ankle")]
+    for i, pose, seen in observations(capture):
+        if i >= 60:
+            seen.keypoints[legs] = np.nan
+            seen.confidence[legs] = 0.0
+        accepted = subject.update(seen, capture.tracks.camera_matrix, pose)
+        if i >= 60:
+            errors.append(
+                np.linalg.norm(subject.estimate(seen.stamp_ns).position[:2] - capture.joints3d_world[i, 0, :2])
+            )
+            located.append(accepted)
+    assert np.mean(located) > 0.9  # a network misses a neck
+    assert np.mean(errors[:30]) < 0.6  # 2 s: longer than a vehicle leans
+    assert np.max(errors) < 2.0
 
 
 def test_velocity_of_a_standing_person_is_small_while_the_position_wanders():
