@@ -14,7 +14,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.packets import decoded_packets
 from drocap_ros.perception.sources.pixels import colour_rank, decoded, raw_to_bgr
 from drocap_ros.recording.session import IMAGES, Message, Session, TopicInfo, header_stamp_ns
-from drocap_ros.stamps import StampValidator
+from drocap_ros.stamps import JUMP_S, NS, StampValidator
 
 if TYPE_CHECKING:
     from drocap_ros.perception.sources.base import Frame
@@ -137,9 +137,13 @@ def _stamped(session: Session, topic: str, problems: Counter[str]) -> Iterator[t
     by_recorder = sum(b > a for a, b in itertools.pairwise(heads)) < (len(heads) - 1) / 2
     if by_recorder:
         session.warn(f"the stamps on {topic} do not advance: the recorder's times are used, late by the transport")
-    stamps = StampValidator()
+    stamps, begun, middle_ns = StampValidator(), False, sorted(heads)[len(heads) // 2] if heads else 0
     for raw, message in session.messages((topic,)):
         stamp_ns = raw.log_time_ns if by_recorder else header_stamp_ns(message)
+        begun = begun or by_recorder or abs(stamp_ns - middle_ns) < JUMP_S * NS
+        if not begun:
+            problems["stamp: expected a time near the next ones, got one from before the clock was set"] += 1
+            continue
         try:
             stamps.check(*divmod(stamp_ns, 10**9))
         except InputError as error:

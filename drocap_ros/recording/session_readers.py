@@ -106,7 +106,8 @@ class RosbagsSession(Session):
 
         try:
             # A folder without metadata.yaml is read by its files.
-            files = [path] if path.is_file() or (path / METADATA_FILE).is_file() else sorted(path.glob("*.db3"))
+            there = sorted(path.glob("*.db3")) or sorted(path.glob("*.bag"))
+            files = [path] if path.is_file() or (path / METADATA_FILE).is_file() else there
             self._reader = AnyReader(files, default_typestore=standard_types())
             self._reader.open()
         except Exception as error:  # noqa: BLE001  # rosbags passes on any error of its storages

@@ -76,6 +76,18 @@ def test_stamps_that_stand_still_give_way_to_the_recorder(tmp_path, messages, st
         assert "do not advance" in session.warnings[0]
 
 
+def test_stamps_from_before_the_clock_was_set_are_left_out(tmp_path, messages):
+    entries = []
+    for i in range(12):
+        time_ns = START_NS + i * STEP_NS
+        message = image_message(messages, random_image(i), time_ns if i > 2 else i * STEP_NS)
+        entries.append(("/camera", message, time_ns, messages.cdr(message)))
+    record(tmp_path / "s", entries)
+    with open_session(tmp_path / "s") as session:
+        assert [f.stamp_ns for f in read_images(session)] == [START_NS + i * STEP_NS for i in range(3, 12)]
+        assert "3 images on /camera were left out" in session.warnings[0]
+
+
 @pytest.mark.parametrize(
     "encoding", ["mono16", "16UC1", "mono12", "bayer_rggb16", "rgb16", "bgr16", "nv12", "nv21", "8UC4"]
 )
