@@ -57,6 +57,10 @@ class Clip:
         """JSON-compatible bounds; None = the end of the recording."""
         return {"start_s": self.start_s, "end_s": None if math.isinf(self.end_s) else self.end_s}
 
+    def holds(self, after_ns: int) -> bool:
+        """Whether a time after the first image, ns, lies in the clip."""
+        return self.start_s * 1e9 - _SLACK_NS <= after_ns <= self.end_s * 1e9 + _SLACK_NS
+
     def select(self, items: Iterable[S]) -> Iterable[S]:
         """The items, in the order of time, whose stamps lie in the clip; nothing after its end is read.
 

@@ -61,6 +61,8 @@ class Selection:
     threads: int = field(default=2, compare=False)
 
 
+#: A person counts after a confirmation, s; whoever is first seen before a clip's end is counted by then.
+_COUNTED_S = 5.0
 _WHOLE, _FOUND = Selection(), Telemetry()
 
 
@@ -204,10 +206,27 @@ def selected_tracks(tracks: Tracks, telemetry: Telemetry, selection: Selection) 
 def persons_of(
     source: str | Path, config: DrocapConfig, models: Path, selection: Selection, progress: Progress | None
 ) -> list[FoundPerson]:
-    """All persons in the selected part of a source's images."""
+    """Persons in the selected part of a source's images, with the numbers that they have in the whole recording.
+
+    Raises
+    ------
+    InputError
+        When a model is missing, or no person is found.
+    """
+    clip, first = selection.clip, list[int]()
     with open_images(source, config.image_ingest, selection.topic) as images:
-        meter = selection.clip.meter(progress, "persons", images.duration_s)
-        return find_persons(selection.clip.select(images.frames), models, config.pose_estimator, meter)
+        meter = clip.meter(progress, "persons", images.duration_s)
+
+        def on_frame(frame: Frame, _: None) -> None:
+            first.extend([frame.stamp_ns] * (not first))
+            meter(frame, None)
+
+        frames = Clip(end_s=clip.end_s + _COUNTED_S).select(images.frames)
+        persons = find_persons(frames, models, config.pose_estimator, on_frame)
+    found = [person for each in persons if (person := each.within(clip, first[0])) is not None]
+    if not found:
+        raise InputError(f"{source}: expected a person from --start to --end, found none; choose another part")
+    return found
 
 
 def follow_selected(
@@ -224,7 +243,7 @@ def follow_selected(
         return config.pose_estimator, None
     persons = persons_of(source, config, models, selection, progress)
     settings = following(config.pose_estimator, persons, selection.person)
-    return settings, persons[selection.person - 1].first_ns
+    return settings, next(person.first_ns for person in persons if person.number == selection.person)
 
 
 def _track(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drocap_ros.clip import Clip
 from drocap_ros.errors import InputError
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.sources.base import Frame, prefetch
@@ -36,6 +37,11 @@ class FoundPerson:
     def last_ns(self) -> int:
         """Stamp of the last detection."""
         return max(self.boxes)
+
+    def within(self, clip: Clip, begin_ns: int) -> FoundPerson | None:
+        """The person in a part of the recording, whose first image has the stamp ``begin_ns``; None outside."""
+        boxes = {stamp_ns: box for stamp_ns, box in self.boxes.items() if clip.holds(stamp_ns - begin_ns)}
+        return dataclasses.replace(self, boxes=boxes) if boxes else None
 
 
 def find_persons(
@@ -95,8 +101,9 @@ def following(config: PoseEstimatorConfig, persons: Sequence[FoundPerson], numbe
     InputError
         When there is no person of that number.
     """
-    if not 1 <= number <= len(persons):
-        raise InputError(f"--subject {number}: expected 1 to {len(persons)}; `drocap track --list` numbers the persons")
-    person = persons[number - 1]
+    person = next((person for person in persons if person.number == number), None)
+    if person is None:
+        there = f"{persons[0].number} to {persons[-1].number}"
+        raise InputError(f"--subject {number}: expected {there}; `drocap track --list` numbers the persons of a part")
     box = ",".join(f"{value:.2f}" for value in person.boxes[person.first_ns])
     return dataclasses.replace(config, subject="box", subject_box=box, on_loss="wait")

@@ -105,6 +105,33 @@ def test_wait_follows_nobody_after_the_subject(tmp_path, capsys):
     assert len(persons[()]) == 2
 
 
+def test_numbers_of_persons_are_those_of_the_whole_recording(tmp_path, capsys):
+    """One man in the first two seconds, another in the last ones."""
+    cv2 = pytest.importorskip("cv2")
+    (tmp_path / "images").mkdir()
+    rate_hz = 5.0
+    men = rendered_images(10, rate_hz), [np.fliplr(image) for image in rendered_images(12, rate_hz, seed=3)]
+    empty = [np.full_like(men[0][0], 120)] * 12
+    for number, image in enumerate([*men[0], *empty, *men[1]]):
+        cv2.imwrite(str(tmp_path / "images" / f"{number:04}.jpg"), cv2.resize(image, (640, 360)))
+    (tmp_path / "config.yaml").write_text(f"image_ingest:\n  folder_rate_hz: {rate_hz}\n")
+    words = ["track", str(tmp_path / "images"), "--models", "simulation", "--config", str(tmp_path / "config.yaml")]
+    words += ["--out", str(tmp_path / "out")]
+    listed = {}
+    for part in ((), ("--start", "4"), ("--end", "2")):
+        assert main([*words, "--list", *part]) == 0
+        listed[part] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("person")]
+    assert [line[:9] for line in listed[()]] == ["person 1:", "person 2:"]
+    assert listed["--start", "4"] == listed[()][1:]
+    assert [line[:9] for line in listed["--end", "2"]] == ["person 1:"]
+    assert main([*words, "--start", "4", "--subject", "2"]) == 0
+    assert len(load_tracks(tmp_path / "out" / "tracks.npz")) == 14
+    assert main([*words, "--start", "4", "--subject", "1"]) == 2
+    assert "--subject 1: expected 2 to 2; `drocap track --list`" in capsys.readouterr().err
+    assert main([*words, "--start", "2.4", "--end", "3.6", "--list"]) == 2
+    assert "expected a person from --start to --end, found none" in capsys.readouterr().err
+
+
 def test_person_who_leaves_the_picture_and_comes_back_is_one_file_and_a_word(models, shared, tmp_path, capsys):
     """A real drone's picture: another man stays in view, and crosses him later."""
     out = tmp_path / "out"
