@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -148,3 +149,30 @@ def of_images(images: Iterable[FixedPoints | None], most_rows: int = MOST_ROWS) 
         np.concatenate([p.track for _, p in found]),
         np.concatenate([p.point for _, p in found]),
     )
+
+
+class PointHistory:
+    """Fixed points of the last images of a live stream, by their stamps; the same messages give the same answers.
+
+    Parameters
+    ----------
+    keep_s : age, before the newest image with points, up to which they are kept
+    """
+
+    def __init__(self, keep_s: float) -> None:
+        self._keep_ns = round(keep_s * 1e9)
+        self._images: OrderedDict[int, FixedPoints] = OrderedDict()
+        #: Stamp of the last image that was taken; 0 = none.
+        self.newest_ns = 0
+
+    def add(self, stamp_ns: int, points: FixedPoints) -> None:
+        """Take an image's points; one before the last image, as in a loop, ends what was before."""
+        if stamp_ns <= self.newest_ns:
+            self._images.clear()
+        self._images[stamp_ns], self.newest_ns = points, stamp_ns
+        while next(iter(self._images)) < stamp_ns - self._keep_ns:
+            self._images.popitem(last=False)
+
+    def along(self, stamp_ns: np.ndarray) -> Background | None:
+        """The points in the images of stamps (F,); None = there are none."""
+        return of_images([self._images.get(stamp) for stamp in stamp_ns.tolist()])

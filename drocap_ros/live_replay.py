@@ -20,7 +20,7 @@ from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_pos
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
-from drocap_ros.recording.published_poses import Agreement, PublishedPoses, RecordedCamera
+from drocap_ros.recording.published_poses import Agreement, PublishedPoses, RecordedCamera, RecordedPoints
 from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.recording.session_tracks import most_frequent_subject
 from drocap_ros.skeleton import BODY_17
@@ -57,7 +57,7 @@ def recorded_config(session: Session) -> DrocapConfig | None:
 def reconstruct_live(
     session: Session, config: DrocapConfig, progress: Progress | None = None
 ) -> tuple[Motion, Tracks, Agreement]:
-    """Motion by the live method, from the session's ``pose2d``, ``vehicle/state`` and ``camera_info`` messages.
+    """Motion by the live method, from the session's messages ``pose2d`` and what the adjuster hears beside them.
 
     The motion is that of the subject in most images.  A frame's pose is that of the last window that holds it, one in
     ``map`` first, else its initial one.  Where at least half of the frames are in ``map``, the motion has these, in
@@ -74,6 +74,7 @@ def reconstruct_live(
     begin = time.perf_counter()
     frames: dict[int, _Frame] = {}
     camera = RecordedCamera(session, topic.name, config.bundle_adjuster.window_s)
+    points = RecordedPoints(session, topic.name, config.bundle_adjuster.window_s)
     stop_reason, iterations = NO_WINDOW, 0
 
     def effort_at(stamp_ns: int) -> Effort | None:
@@ -85,9 +86,8 @@ def reconstruct_live(
         config.initializer,
         config.bundle_adjuster,
         effort_at if published.has_windows else None,
-        lambda stamp_ns, size: camera.along(
-            stamp_ns, size, published.telemetry_ns if published.has_windows else int(stamp_ns[-1])
-        ),
+        lambda stamp_ns, size: camera.along(stamp_ns, size, published.known_ns(int(stamp_ns[-1]))[0]),
+        lambda stamp_ns: points.along(stamp_ns, published.known_ns(int(stamp_ns[-1]))[1]),
     )
     for done, result in enumerate(results):
         if isinstance(result, LivePose):

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drocap_ros.background import Background, FixedPoints, of_images
+from drocap_ros.background import Background, FixedPoints, PointHistory, of_images
 from drocap_ros.clip import Clip
 from drocap_ros.errors import InputError
 from drocap_ros.skeleton import BODY_15
@@ -120,3 +120,19 @@ def test_a_long_recording_keeps_the_points_of_some_images(most, frames):
     background = of_images(images_of([10] * 12), most)
     assert sorted(set(background.frame.tolist())) == list(frames)
     assert len(background) == 10 * len(frames) <= most
+
+
+def test_a_history_keeps_the_last_seconds_of_a_stream_and_starts_anew_with_a_loop():
+    history = PointHistory(keep_s=1.0)
+    points = FixedPoints(np.array([7, 9]), np.zeros((2, 2), np.float32))
+    for stamp in range(10):
+        history.add(stamp * 250_000_000, points)
+    assert history.newest_ns == 2_250_000_000
+    window = np.arange(10) * 250_000_000
+    kept = history.along(window)
+    # Those of the last second alone, so that an endless stream takes no more memory.
+    assert sorted(set(kept.frame.tolist())) == [5, 6, 7, 8, 9]
+    assert history.along(window[:4]) is None
+    history.add(0, points)
+    assert history.newest_ns == 0
+    assert set(history.along(window).frame.tolist()) == {0}

@@ -1,9 +1,9 @@
 """Node ``bundle_adjuster``: adjusts the last seconds of poses together.
 
-Subscribes ``pose2d``, ``pose3d/initial``, ``vehicle/state`` and ``camera_info``; publishes ``pose3d/refined``
-(drocap_ros/Pose3DWindow), and for every image ``pose3d/latest`` (drocap_ros/Pose3D): its initial pose with the bone
-lengths of the last window, stage INITIAL until there is one.  With the camera's pose and a measured scale both are in
-``map``, else in the camera's optical frame; ``/diagnostics`` says why.
+Subscribes ``pose2d``, ``pose3d/initial``, ``background``, ``vehicle/state`` and ``camera_info``; publishes
+``pose3d/refined`` (drocap_ros/Pose3DWindow), and for every image ``pose3d/latest`` (drocap_ros/Pose3D): its initial
+pose with the bone lengths of the last window, stage INITIAL until there is one.  With the camera's pose and a measured
+scale both are in ``map``, else in the camera's optical frame; ``/diagnostics`` says why.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from std_msgs.msg import Header
 
+from drocap_ros.background import PointHistory
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory
-from drocap_ros.msg import Pose2D, Pose3D
+from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
@@ -28,7 +29,7 @@ from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, EffortControl, TelemetryUse, Window
-from drocap_ros.recording.pose_messages import add_calibration, add_state, float_array
+from drocap_ros.recording.pose_messages import add_calibration, add_state, fixed_points_from_message, float_array
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import (
     latest_pose_to_ros,
@@ -59,7 +60,7 @@ class _Solved(NamedTuple):
     failure: str
     header: Header
     track_id: int
-    telemetry_ns: int
+    known_ns: tuple[int, int]
     seconds: float
 
 
@@ -68,7 +69,7 @@ class BundleAdjusterNode(ComponentNode):
 
     The period is counted in image stamps, so that a replay at another speed adjusts the same windows.  An adjustment
     ends after the step in which ``max_solve_s`` is over; after a slow one the next takes fewer images.  The message's
-    ``stride`` and ``steps`` state both, its ``telemetry_stamp`` the newest vehicle state that was known.  In simulated
+    ``stride`` and ``steps`` state both, its ``telemetry_stamp`` and ``background_stamp`` what was known.  In simulated
     time an adjustment is never cut, and its result comes with the first image ``max_solve_s`` after the newest one of
     its window.
     """
@@ -84,7 +85,7 @@ class BundleAdjusterNode(ComponentNode):
         self._control = EffortControl(self.config.max_solve_s, self.config.max_stride)
         self._latest_pose = LatestPose(self.config.blend_s)
         self._latest_place = LatestPlace(self.config.blend_s)
-        self._cameras = CameraHistory(self.config.window_s)
+        self._cameras, self._points = CameraHistory(self.config.window_s), PointHistory(self.config.window_s)
         self._join: StampJoin[PoseObservation, Pose3D] = StampJoin(self.config.max_pending)
         self._worker = ThreadPoolExecutor(1, "bundle_adjuster")
         self._job: Future[_Solved] | None = None  # in simulated time its result is still to be published
@@ -98,6 +99,7 @@ class BundleAdjusterNode(ComponentNode):
         self._latest = self.output("pose3d/latest")
         self.input("pose2d", self._on_pose2d)
         self.input("pose3d/initial", self._on_initial)
+        self.input("background", self._on_background)
         self.input("vehicle/state", partial(add_state, self._cameras))
         self.input("camera_info", partial(add_calibration, self._cameras))
 
@@ -124,6 +126,9 @@ class BundleAdjusterNode(ComponentNode):
         self._subject_in_view = observation.has_subject
         if observation.has_subject:
             self._on_pair(self._join.add_first(observation.stamp_ns, observation))
+
+    def _on_background(self, message: BackgroundTracks) -> None:
+        self._points.add(stamp_from_ros(message.header.stamp), fixed_points_from_message(message))
 
     def _on_initial(self, message: Pose3D) -> None:
         pose3d_from_ros(message)
@@ -165,8 +170,12 @@ class BundleAdjusterNode(ComponentNode):
         self._job_subject = self._buffer.subject
         self._job_due_ns = observation.stamp_ns + round(self.config.max_solve_s * 1e9)
         window = self._buffer.window()
-        window = window._replace(camera=self._cameras.along(window.stamp_ns, observation.image_size))
-        arguments = initial.header, observation.track_id, self._cameras.newest_ns, self._control.stride
+        window = window._replace(
+            camera=self._cameras.along(window.stamp_ns, observation.image_size),
+            background=self._points.along(window.stamp_ns),
+        )
+        known_ns = self._cameras.newest_ns, self._points.newest_ns
+        arguments = initial.header, observation.track_id, known_ns, self._control.stride
         self._job = self._worker.submit(self._adjust, window, *arguments)
 
     def _publish_latest(self, observation: PoseObservation, initial: Pose3D, joints: np.ndarray) -> None:
@@ -198,7 +207,7 @@ class BundleAdjusterNode(ComponentNode):
             self._latest_pose.set_solution(median_bone_lengths(solved.window.joints3d), stamp_ns)
             self._latest_place.set_solution(solved.window, stamp_ns)
 
-    def _adjust(self, window: Window, header: Header, track_id: int, telemetry_ns: int, stride: int) -> _Solved:
+    def _adjust(self, window: Window, header: Header, track_id: int, known_ns: tuple[int, int], stride: int) -> _Solved:
         """Adjust a window in the worker, which in real time also publishes the result."""
         begin = time.perf_counter()
         deadline = math.inf if self.simulated else begin + self.config.max_solve_s
@@ -207,7 +216,7 @@ class BundleAdjusterNode(ComponentNode):
             result = self._adjuster.adjust(window, Effort(stride), lambda: time.perf_counter() > deadline)
         except SOLVER_ERRORS as error:
             failure = str(error)
-        solved = _Solved(result, failure, header, track_id, telemetry_ns, time.perf_counter() - begin)
+        solved = _Solved(result, failure, header, track_id, known_ns, time.perf_counter() - begin)
         if not self.simulated:
             self._publish(solved)
         return solved
@@ -225,7 +234,7 @@ class BundleAdjusterNode(ComponentNode):
         if window.effort.stride > 1:
             self.count(Key.ADJUSTMENTS_STRIDED)
         self._refined.publish(
-            window_to_ros(window, solved.header, solved.track_id, self._sequence, seconds, solved.telemetry_ns)
+            window_to_ros(window, solved.header, solved.track_id, self._sequence, seconds, solved.known_ns)
         )
         self._sequence += 1
         self.count(Key.ADJUSTMENTS)
@@ -241,6 +250,7 @@ class BundleAdjusterNode(ComponentNode):
             use = TelemetryUse.LATE
         self.details[Key.TELEMETRY] = use.name.lower()
         self.details[Key.TELEMETRY_REFUSED] = reason
+        self.details[Key.CALIBRATION] = window.calibration
         self._had_telemetry |= use is TelemetryUse.USED
         words = _WORDS[use].format(reason)
         refused = use is TelemetryUse.REFUSED or (self._had_telemetry and use is TelemetryUse.LATE)

@@ -5,21 +5,24 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from drocap_ros.background import Background, PointHistory
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory, WindowCamera
 from drocap_ros.recording import session as recorded
-from drocap_ros.recording.pose_messages import add_calibration, add_state
+from drocap_ros.recording.pose_messages import add_calibration, add_state, fixed_points_from_message
 from drocap_ros.recording.session import Message, Session, header_stamp_ns, stamp_of
 from drocap_ros.stamps import StampValidator
 
 _INITIAL = 1  # Pose3D.INITIAL
+Take: TypeAlias = Callable[[Message], None]
 
 
 @dataclass
@@ -45,7 +48,7 @@ class PublishedWindow(NamedTuple):
     stamp_ns : of its last image
     fingerprint : of its stamps and joints
     stride, steps : the effort of its adjustment: of the images, and of its two solutions where they were limited
-    telemetry_ns : stamp of the newest state of the vehicle that it knew, 0 = none
+    telemetry_ns, background_ns : stamps of the newest state of the vehicle and fixed points that it knew, 0 = none
     """
 
     stamp_ns: int
@@ -53,6 +56,41 @@ class PublishedWindow(NamedTuple):
     stride: int
     steps: tuple[int, int] | None
     telemetry_ns: int
+    background_ns: int
+
+
+class _UpTo:
+    """Gives a history the messages of a topic, in their order, up to one of a stamp."""
+
+    def __init__(self, history: CameraHistory | PointHistory, messages: Iterator[Message], take: Take) -> None:
+        self._history, self._messages, self._take = history, messages, take
+        self._next = next(messages, None)
+
+    def go(self, newest_ns: int) -> None:
+        while self._next is not None and self._history.newest_ns != newest_ns:
+            if self._history.newest_ns < newest_ns < header_stamp_ns(self._next):
+                break  # the recording lacks that message
+            with contextlib.suppress(InputError):  # the live graph refused it too
+                self._take(self._next)
+            self._next = next(self._messages, None)
+
+
+class RecordedPoints:
+    """The scene's fixed points as the live graph had them at each of its adjustments; messages are streamed."""
+
+    def __init__(self, session: Session, near: str, keep_s: float) -> None:
+        self._history = history = PointHistory(keep_s)
+        name = f"{near.rsplit('/', 1)[0]}/background"
+        self._messages = _UpTo(
+            history,
+            _accepted(_messages(session, recorded.BACKGROUND_TRACKS, name)),
+            lambda message: history.add(header_stamp_ns(message), fixed_points_from_message(message)),
+        )
+
+    def along(self, stamp_ns: np.ndarray, newest_ns: int) -> Background | None:
+        """The points in a window's images (F,), by the messages up to that of the stamp ``newest_ns``."""
+        self._messages.go(newest_ns)
+        return self._history.along(stamp_ns)
 
 
 class RecordedCamera:
@@ -61,8 +99,8 @@ class RecordedCamera:
     def __init__(self, session: Session, near: str, keep_s: float) -> None:
         base = near.rsplit("/", 1)[0]
         self._history = CameraHistory(keep_s)
-        self._states = _accepted(_messages(session, recorded.VEHICLE_STATE, f"{base}/vehicle/state"))
-        self._next = next(self._states, None)
+        states = _accepted(_messages(session, recorded.VEHICLE_STATE, f"{base}/vehicle/state"))
+        self._states = _UpTo(self._history, states, partial(add_state, self._history))
         for message in _accepted(_messages(session, recorded.CAMERA_INFO, f"{base}/camera_info")):
             with contextlib.suppress(InputError):  # the live graph refused it too
                 add_calibration(self._history, message)
@@ -70,13 +108,8 @@ class RecordedCamera:
 
     def along(self, stamp_ns: np.ndarray, size: tuple[int, int], newest_ns: int) -> WindowCamera | None:
         """The camera at a window's images (F,) of a size, by the states up to that of the stamp ``newest_ns``."""
-        history = self._history
-        while self._next is not None and history.newest_ns != newest_ns:
-            if history.newest_ns < newest_ns < header_stamp_ns(self._next):
-                break  # the recording lacks that state
-            add_state(history, self._next)
-            self._next = next(self._states, None)
-        camera = history.along(stamp_ns, size)
+        self._states.go(newest_ns)
+        camera = self._history.along(stamp_ns, size)
         self.matrix = self.matrix if camera is None else camera.matrix
         return camera
 
@@ -98,10 +131,10 @@ class PublishedPoses:
             stamps = np.array([header_stamp_ns(pose) for pose in m.poses], np.int64)
             joints = np.array([_joints(pose) for pose in m.poses])
             steps = (int(m.steps[0]), int(m.steps[1])) if len(m.steps) else None
-            known_ns = stamp_of(m.telemetry_stamp)
-            self._windows.append(
-                PublishedWindow(header_stamp_ns(m), _fingerprint(stamps, joints), int(m.stride), steps, known_ns)
-            )
+            # Windows of before did not use fixed points.
+            points_ns = stamp_of(m.background_stamp) if hasattr(m, "background_stamp") else 0
+            of = header_stamp_ns(m), _fingerprint(stamps, joints), int(m.stride)
+            self._windows.append(PublishedWindow(*of, steps, stamp_of(m.telemetry_stamp), points_ns))
         self.has_windows = bool(self._windows)
 
     def next_window(self, stamp_ns: int) -> PublishedWindow | None:
@@ -113,10 +146,14 @@ class PublishedPoses:
             self._current = self._windows.popleft()
         return self._current
 
-    @property
-    def telemetry_ns(self) -> int:
-        """Of the window that :meth:`next_window` returned last: stamp of the newest state that it knew, 0 = none."""
-        return 0 if self._current is None else self._current.telemetry_ns
+    def known_ns(self, newest_ns: int) -> tuple[int, int]:
+        """Of the window that :meth:`next_window` returned last: stamps of the newest state and fixed points it knew.
+
+        0 = none; without any windows what is as old as the newest image is known.
+        """
+        if not self.has_windows:
+            return newest_ns, newest_ns
+        return (0, 0) if self._current is None else (self._current.telemetry_ns, self._current.background_ns)
 
     def compare_initial(self, stamp_ns: int, joints: np.ndarray) -> None:
         """Compare with the published pose of the same stamp, if any."""

@@ -167,11 +167,12 @@ def window_to_ros(
     track_id: int,
     sequence: int,
     solve_seconds: float,
-    telemetry_ns: int = 0,
+    known_ns: tuple[int, int] = (0, 0),
 ) -> Pose3DWindow:
     """Adjusted window -> message.
 
-    header : stamp of the newest image and frame of its initial pose; telemetry_ns : stamp of the newest vehicle state
+    header : stamp of the newest image and frame of its initial pose
+    known_ns : stamps of the newest vehicle state and fixed points that it knew
     """
     in_map = window.in_map
     frame_id = header.frame_id if in_map is None else MAP
@@ -200,7 +201,8 @@ def window_to_ros(
         solve_seconds=solve_seconds,
         stride=window.effort.stride,
         steps=array("I", window.effort.steps or ()),
-        telemetry_stamp=stamp_to_ros(telemetry_ns),
+        telemetry_stamp=stamp_to_ros(known_ns[0]),
+        background_stamp=stamp_to_ros(known_ns[1]),
     )
 
 

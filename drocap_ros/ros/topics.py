@@ -101,7 +101,7 @@ NODES: dict[str, NodeEntry] = {
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(
         ("pose3d/refined", "pose3d/latest"),
-        ("pose2d", "pose3d/initial", "vehicle/state", "camera_info"),
+        ("pose2d", "pose3d/initial", "background", "vehicle/state", "camera_info"),
         live=True,
         niceness=15,
     ),

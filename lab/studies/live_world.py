@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.background import Background
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.protocol import FPS, reported
 from drocap_ros.evaluation.tables import WORLD_HEAD, markdown_table, world_cells
@@ -42,6 +43,7 @@ def live_world_study(
     folder: Path,
     telemetry: str = "exact",
     *,
+    background: bool = False,
     every: int = 1,
     delay_s: float = 0.5,
     limit: int | None = None,
@@ -58,7 +60,7 @@ def live_world_study(
     """
     sequences = world_sequences(folder, every, limit)
     rows = [
-        _row(sequence.name, world_view(sequence, WorldCase(telemetry), seed=seed), delay_s)
+        _row(sequence.name, world_view(sequence, WorldCase(telemetry, background=background), seed=seed), delay_s)
         for seed, sequence in reported(sequences, len(sequences), "live world study", progress)
     ]
     return [row for row in rows if row is not None]
@@ -88,7 +90,11 @@ def _live(view: WorldView, delay_s: float) -> tuple[dict[int, np.ndarray], dict[
     latest, refined = dict[int, np.ndarray](), dict[int, np.ndarray]()
     lengths, placing = LatestPose(adjuster.blend_s), LatestPlace(adjuster.blend_s)
     pending = deque[AdjustedWindow]()
-    for result in live_poses(observations(view), InitializerConfig(), adjuster, camera_at=history.along):
+    points_at = _points(view)
+    results = live_poses(
+        observations(view), InitializerConfig(), adjuster, camera_at=history.along, points_at=points_at
+    )
+    for result in results:
         if isinstance(result, LivePose):
             now, o = result.observation.stamp_ns, result.observation
             while pending and pending[0].stamp_ns[-1] + delay_s * 1e9 <= now:
@@ -123,6 +129,12 @@ def _history(view: WorldView) -> CameraHistory:
     for stamp, position, turn in zip(tracks.stamp_ns.tolist(), tracks.camera_position, turns, strict=True):
         history.add_pose(stamp, position, turn)
     return history
+
+
+def _points(view: WorldView) -> Callable[[np.ndarray], Background | None]:
+    """Gives the fixed points in the images of a window's stamps (F,)."""
+    points, stamps = view.tracks.background, view.tracks.stamp_ns
+    return lambda window: None if points is None else points.of_frames(np.searchsorted(stamps, window))
 
 
 def _errors(poses: dict[int, np.ndarray], truth: np.ndarray) -> WorldErrors:

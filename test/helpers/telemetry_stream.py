@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from drocap_ros.background import Background
+from drocap_ros.evaluation.world_scene import PinholePath, followed_points
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
@@ -32,6 +35,17 @@ class Orbit:
     @property
     def stamp_ns(self) -> np.ndarray:
         return np.array([o.stamp_ns for o in self.observations], np.int64)
+
+    @cached_property
+    def background(self) -> Background:
+        """The scene's fixed points."""
+        size = self.observations[0].image_size
+        path = PinholePath(self.position, self.rotation, float(self.matrix[0, 0]), size)
+        return followed_points(path, self.truth, FPS, 0)
+
+    def points_at(self, stamp_ns: np.ndarray) -> Background:
+        """Those in the images of stamps (F,)."""
+        return self.background.of_frames(np.searchsorted(self.stamp_ns, stamp_ns))
 
     def history(self, frames: slice = slice(None), keep_s: float = 12.0) -> CameraHistory:
         """The poses of some images and the calibration, as they arrive."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from telemetry_stream import orbit
 
+from drocap_ros.background import FixedPoints
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.frames import OPTICAL_FROM_FLU
@@ -18,6 +19,7 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import (
+    background_to_ros,
     camera_info_to_ros,
     header_at,
     pose2d_to_ros,
@@ -164,10 +166,10 @@ def orbited(tmp_path_factory):
             graph.node.create_subscription(TOPICS[topic].message, topic, messages.append, TOPICS[topic].qos)
         publishers = {
             topic: graph.node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
-            for topic in ("pose2d", "vehicle/state", "camera_info")
+            for topic in ("pose2d", "vehicle/state", "camera_info", "background")
         }
         graph.wait_until(
-            lambda: [p.get_subscription_count() for p in publishers.values()] == [3, 2, 2], 20, "the nodes to listen"
+            lambda: [p.get_subscription_count() for p in publishers.values()] == [3, 2, 2, 2], 20, "the nodes to listen"
         )
         for i, observation in enumerate(flown.observations):
             stamp_ns = observation.stamp_ns
@@ -175,6 +177,9 @@ def orbited(tmp_path_factory):
                 state = VehicleState(stamp_ns, position_enu_m=flown.position[i], gimbal_orientation_xyzw=gimbal[i])
                 publishers["vehicle/state"].publish(vehicle_state_to_ros(state))
             publishers["camera_info"].publish(camera_info_to_ros(header_at(stamp_ns, "camera"), camera))
+            seen_here = flown.background.frame == i
+            points = FixedPoints(flown.background.track[seen_here], flown.background.point[seen_here])
+            publishers["background"].publish(background_to_ros(points, header_at(stamp_ns, "camera")))
             publishers["pose2d"].publish(pose2d_to_ros(observation, "camera"))
             graph.spin_for(0.066)
         reports = len(seen["/diagnostics"])
@@ -205,6 +210,8 @@ def test_poses_with_telemetry_are_in_map_and_metric_until_it_stops(orbited):
     assert max(stamp_from_ros(m.header.stamp) for m in placed) < BEGIN + 9.4 * S
     used = [{v.key: v.value for v in status.values} for status in texts]
     assert {"used", "late"} <= {values.get(Key.TELEMETRY) for values in used}
+    assert any("yaw" in values.get(Key.CALIBRATION, "") for values in used)
+    assert any(window.background_stamp.sec for window in seen["pose3d/refined"])
     assert used[-1][Key.FRAME] == "camera"
     assert texts[-1].level == b"\1"
     assert "no reported camera pose" in texts[-1].message

@@ -132,9 +132,10 @@ def test_a_window_in_map_states_frame_scale_camera_and_the_newest_state():
     rotation = np.stack([matrix_from_quaternion(np.array([0.5, -0.5, 0.1 * i, 0.7])) for i in range(3)])
     window = replace(adjusted(Effort()), in_map=InMap(rotation, np.zeros((3, 3)), np.zeros(6)))
     # The newest image is later than the newest pose: the camera's pose there was not known yet.
-    message = c.window_to_ros(window, c.header_at(10**9, "camera"), 7, 5, 0.25, telemetry_ns=950_000_000)
+    message = c.window_to_ros(window, c.header_at(10**9, "camera"), 7, 5, 0.25, (950_000_000, 960_000_000))
     assert c.stamp_from_ros(message.header.stamp) == 10**9
     assert c.stamp_from_ros(message.telemetry_stamp) == 950_000_000
+    assert c.stamp_from_ros(message.background_stamp) == 960_000_000
     assert {m.header.frame_id for m in (message, *message.poses)} == {"map"}
     for pose, turn in zip(message.poses, rotation, strict=True):
         q = pose.camera_orientation

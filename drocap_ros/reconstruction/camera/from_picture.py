@@ -195,13 +195,9 @@ def _checked(camera: PictureCamera, found: AdjustedPath, share: float) -> Pictur
     """The camera with what its adjustment tells, and whether it fits."""
     focal = float(np.exp(found.shared[FOCAL]))
     steps = None if found.posterior is None else np.sqrt(np.diagonal(found.posterior.steps, axis1=1, axis2=2))
-    fits = (
-        found.residual_px < _LARGEST_PX * camera.matrix[0, 2] * 2 / 1280.0
-        and np.mean(found.weight > 0.25) > _LEAST_FITTING
-    )
     return replace(
         camera,
-        kind=camera.kind if fits else Kind.NOTHING_FIXED,
+        kind=camera.kind if fits(found, camera.matrix) else Kind.NOTHING_FIXED,
         matrix=with_focal(camera.matrix, focal),
         focal_std=float(np.hypot(found.shared_std[FOCAL], _LASTING_FOCAL_STD)) if camera.focal_std else 0.0,
         points=found.points,
@@ -210,6 +206,12 @@ def _checked(camera: PictureCamera, found: AdjustedPath, share: float) -> Pictur
         position_std=float("nan") if steps is None else float(np.median(steps[:, :3])),
         turn_std_deg=float("nan") if steps is None else float(np.degrees(np.median(steps[:, 3:]))),
     )
+
+
+def fits(found: AdjustedPath, matrix: np.ndarray) -> bool:
+    """Whether a path explains the points that it was adjusted by."""
+    near = found.residual_px < _LARGEST_PX * matrix[0, 2] * 2 / 1280.0
+    return bool(near and np.mean(found.weight > 0.25) > _LEAST_FITTING)
 
 
 def with_focal(matrix: np.ndarray, factor: float) -> np.ndarray:

@@ -22,7 +22,7 @@ from drocap_ros.reconstruction.camera.path_model import (
     PathConfig,
     PathInput,
 )
-from drocap_ros.reconstruction.camera.views import Views, views_of
+from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
 from drocap_ros.reconstruction.common.windows import fade_weights, windows
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
@@ -72,6 +72,7 @@ class FusedTelemetry:
     tracks : with the corrected camera
     covariance : (F, 6, 6) of the camera's position (m) and rotation (rad, camera axes)
     config : of the adjustment in the world: what is left of the telemetry's errors
+    path : of the longest part, as adjusted
     measured : JSON-compatible, of the longest part: constant errors and their standard deviations, and the points
     """
 
@@ -79,12 +80,15 @@ class FusedTelemetry:
     covariance: np.ndarray
     config: WorldConfig
     measured: dict[str, Any]
+    path: AdjustedPath
 
 
-def fuse_telemetry(tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refusal | None:
+def fuse_telemetry(
+    tracks: Tracks, config: WorldConfig, known: np.ndarray | None = None
+) -> FusedTelemetry | Refusal | None:
     """Correct the telemetry of tracks with a background; None = there is none of both, or the points are too few.
 
-    A refusal where no camera's path near the telemetry explains the points.
+    A refusal where no camera's path near the telemetry explains the points.  ``known`` : as of ``PathInput``.
     """
     rotation, position, points = tracks.camera_rotation, tracks.camera_position, tracks.background
     if points is None or rotation is None or position is None or not refinable(tracks):
@@ -102,7 +106,7 @@ def fuse_telemetry(tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refu
         for inside in windows(part.stop - part.start, _WINDOW, _OVERLAP):
             rows = slice(part.start + inside.start, part.start + inside.stop)
             given = CameraTelemetry(turn[rows], path[rows], fps)
-            found = _of_window(given, tracks, slot, rows.start, config)
+            found = _of_window(given, tracks, (slot, rows.start), config, known)
             if isinstance(found, Refusal) or found is None:
                 return found
             faded.add(rows, fade_weights(inside, part.stop - part.start, _OVERLAP), given, found)
@@ -120,20 +124,25 @@ def fuse_telemetry(tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refu
         camera_rotation=(exp_so3(change[:, 3:]) @ turn)[slot],
         camera_position=(path + change[:, :3])[slot] + origin,
     )
-    return FusedTelemetry(corrected, covariance[slot], _left(config, steps), measured)
+    return FusedTelemetry(corrected, covariance[slot], _left(config, steps), measured, best[0])
 
 
 def _of_window(
-    given: CameraTelemetry, tracks: Tracks, slot: np.ndarray, begin: int, config: WorldConfig
+    given: CameraTelemetry,
+    tracks: Tracks,
+    slots: tuple[np.ndarray, int],
+    config: WorldConfig,
+    known: np.ndarray | None,
 ) -> AdjustedPath | Refusal | None:
-    """The path of the slots from ``begin`` on; None = its points are too few."""
+    """The path of the tracks' slots (F,) from the first of some on; None = its points are too few."""
+    slot, begin = slots
     points, matrix = tracks.background, tracks.camera_matrix
     assert points is not None
     assert matrix is not None
     frame = slot[points.frame] - begin
     inside = (frame >= 0) & (frame < given.frames)
     views = views_of(frame[inside], points.track[inside], points.point[inside], given.frames, given.fps)
-    found = _adjusted(given, matrix, views, config)
+    found = _adjusted(PathInput(given, matrix, views, path_config(config), known))
     if found is None or found.covered < _LEAST_COVERED:
         return None
     if found.residual_px > _LARGEST_RESIDUAL * 1e-3 * float(matrix[0, 0]):
@@ -141,12 +150,9 @@ def _of_window(
     return found
 
 
-def _adjusted(given: CameraTelemetry, matrix: np.ndarray, views: Views, config: WorldConfig) -> AdjustedPath | None:
-    """The path by errors as the configuration expects them, or by larger ones where the points show such.
-
-    Errors that are expected to wander far would take the part of a constant yaw.
-    """
-    own = PathConfig(
+def path_config(config: WorldConfig) -> PathConfig:
+    """The errors that the adjustment in the world expects of a reported path, for that by points."""
+    return PathConfig(
         tilt_deg=config.tilt_error_deg,
         yaw_deg=config.yaw_error_deg,
         latency_s=config.latency_std_s,
@@ -154,7 +160,15 @@ def _adjusted(given: CameraTelemetry, matrix: np.ndarray, views: Views, config: 
         attitude_wander_deg=config.attitude_wander_deg,
         acceleration_m_s2=config.camera_acceleration_m_s2,
     )
-    first = adjust_path(PathInput(given, matrix, views, own))
+
+
+def _adjusted(data: PathInput) -> AdjustedPath | None:
+    """The path by errors as they are expected, or by larger ones where the points show such.
+
+    Errors that are expected to wander far would take the part of a constant yaw.
+    """
+    given, own = data.path, data.config
+    first = adjust_path(data)
     if first is None or first.posterior is None:
         return None
     position_m, attitude_deg = _wander(first, given.fps)
@@ -165,22 +179,21 @@ def _adjusted(given: CameraTelemetry, matrix: np.ndarray, views: Views, config: 
         0.5 * tilt_deg / own.tilt_deg,  # two standard deviations of a constant are no exception
     )
     if max(over) < _OTHER:
-        return _without_latency(given, matrix, views, first, own)
+        return _without_latency(data, first)
     wide = replace(
         own,
         tilt_deg=max(own.tilt_deg, _WIDE_TILT_DEG),
         position_wander_m=max(position_m, _WIDE_POSITION_M),
         attitude_wander_deg=max(attitude_deg, _WIDE_ATTITUDE_DEG),
     )
-    second = adjust_path(PathInput(given, matrix, views, wide), first.state)
+    data = replace(data, config=wide)
+    second = adjust_path(data, first.state)
     if second is None or second.posterior is None:
         return first
-    return _without_latency(given, matrix, views, second, wide)
+    return _without_latency(data, second)
 
 
-def _without_latency(
-    given: CameraTelemetry, matrix: np.ndarray, views: Views, found: AdjustedPath, config: PathConfig
-) -> AdjustedPath:
+def _without_latency(data: PathInput, found: AdjustedPath) -> AdjustedPath:
     """The path once more, by reports of the right time, where their latencies are found and are long.
 
     The adjustment shifts a path by its smoothed motion, which takes a tenth of a latency for a part of the wander.
@@ -189,13 +202,15 @@ def _without_latency(
     std = found.shared_std[[ATTITUDE_LATENCY, POSITION_LATENCY]]
     if np.abs(latencies).max() < _LONG_S or not (std < _SURE * np.abs(latencies).max()).all():
         return found
-    later = at_other_time(given, *latencies.tolist())
+    later = at_other_time(data.path, *latencies.tolist())
     shared = found.state.shared.copy()
     shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] = 0.0
-    again = adjust_path(PathInput(later, matrix, views, config), replace(found.state, shared=shared))
+    again = adjust_path(replace(data, path=later), replace(found.state, shared=shared))
     if again is None or again.posterior is None:
         return found
     again.shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] += latencies
+    precision, vector = again.facts
+    vector += precision[:, [ATTITUDE_LATENCY, POSITION_LATENCY]] @ latencies
     return again
 
 

@@ -12,6 +12,7 @@ from drocap_ros.reconstruction.camera.path_posterior import Posterior, posterior
 from drocap_ros.reconstruction.camera.path_residuals import OUTLIER_SQUARE, PathResiduals, weights_of
 from drocap_ros.reconstruction.camera.views import Views, triangulate
 from drocap_ros.reconstruction.common.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
+from drocap_ros.reconstruction.world.findings import Findings
 
 #: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 5e-4
@@ -38,6 +39,7 @@ class AdjustedPath:
     shared, shared_std : (SHARED,) misalignment (rad, camera axes), latencies of attitude and position (s: the given
         path of so much later is the true one), logarithm of the focal length over the given one; deviation 0 = held,
         NaN = unknown
+    facts : of the shared unknowns by points and path alone, without priors
     views : the N observations that were used
     points : (J, 4) x y z m, w: a point at x y z / w; weight : (N,) of the observations, about 0 = wrong
     residual_px : median length of the residuals
@@ -49,6 +51,7 @@ class AdjustedPath:
     position: np.ndarray
     shared: np.ndarray
     shared_std: np.ndarray
+    facts: Findings
     views: Views
     points: np.ndarray
     weight: np.ndarray
@@ -173,6 +176,7 @@ def _solution(r: PathResiduals, found: Posterior | None, iterations: int, stop_r
         position=r.position,
         shared=r.state.shared,
         shared_std=np.where(r.weights.free, std, 0.0),
+        facts=_facts(r, found),
         views=views,
         points=r.state.points * np.array([r.state.unit] * 3 + [1.0]),
         weight=np.square(r.robust),
@@ -184,3 +188,13 @@ def _solution(r: PathResiduals, found: Posterior | None, iterations: int, stop_r
         iterations=iterations,
         stop_reason=stop_reason,
     )
+
+
+def _facts(r: PathResiduals, found: Posterior | None) -> Findings:
+    """What points and path alone tell of the shared unknowns."""
+    free, facts = np.ix_(r.weights.free, r.weights.free), np.zeros((SHARED, SHARED))
+    priors = r.weights.shared / r.data.config.views_per_fact
+    if found is not None and r.weights.free.any():
+        size, axes = np.linalg.eigh(np.linalg.inv(found.shared[free]) - priors[free])
+        facts[free] = (axes * np.maximum(size, 0.0)) @ axes.T
+    return Findings(facts, (facts + priors) @ r.state.shared)

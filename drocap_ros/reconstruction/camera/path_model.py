@@ -61,12 +61,16 @@ class PathConfig:
 
 @dataclass(frozen=True)
 class PathInput:
-    """What is given: the path of F evenly spaced frames, camera matrix (3, 3) px, and observations of fixed points."""
+    """What is given: the path of F evenly spaced frames, camera matrix (3, 3) px, and observations of fixed points.
+
+    known : (SHARED, SHARED) inverse covariance of the shared unknowns about zero, beside the expected errors
+    """
 
     path: CameraTelemetry
     matrix: np.ndarray
     views: Views
     config: PathConfig = field(default_factory=PathConfig)
+    known: np.ndarray | None = None
 
     @cached_property
     def knots(self) -> Knots:

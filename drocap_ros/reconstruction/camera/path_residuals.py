@@ -23,6 +23,7 @@ from drocap_ros.reconstruction.camera.path_model import (
     MISALIGNMENT,
     POSITION_LATENCY,
     SHARED,
+    PathConfig,
     PathInput,
     PathState,
     tangents,
@@ -60,7 +61,26 @@ def weights_of(data: PathInput) -> PathWeights:
     wander_s = np.repeat([config.position_wander_s, config.attitude_wander_s], 3)
     first = np.repeat([config.position_wander_m, np.deg2rad(config.attitude_wander_deg)], 3) ** -2.0
     keep = np.exp(-step_s / wander_s)
-    axes = data.path.gimbal_axes()
+    shared = expected_shared(config, data.path.gimbal_axes())
+    free = np.diag(shared) > 0.0
+    if data.known is not None:
+        shared = shared + np.where(free[:, None] & free, data.known, 0.0)
+    fact = config.views_per_fact
+    return PathWeights(
+        keep=keep,
+        change=fact * first / (1.0 - keep**2),
+        first=fact * first,
+        acceleration=fact * (config.acceleration_m_s2 * step_s**2) ** -2.0,
+        shared=fact * shared,
+        free=free,
+    )
+
+
+def expected_shared(config: PathConfig, axes: np.ndarray) -> np.ndarray:
+    """(SHARED, SHARED) inverse covariance of the shared unknowns; rows and columns of held ones are zero.
+
+    axes : (3, 3) of the gimbal, rows in camera axes
+    """
     turned = np.deg2rad([config.tilt_deg, config.yaw_deg, config.tilt_deg])
     covariance = np.zeros((SHARED, SHARED))
     covariance[MISALIGNMENT, MISALIGNMENT] = axes.T @ np.diag(turned**2) @ axes
@@ -73,15 +93,7 @@ def weights_of(data: PathInput) -> PathWeights:
     free[latencies], free[FOCAL] = config.latency_s > 0.0, config.focal > 0.0
     inside = np.ix_(free, free)
     shared[inside] = np.linalg.inv(covariance[inside])
-    fact = config.views_per_fact
-    return PathWeights(
-        keep=keep,
-        change=fact * first / (1.0 - keep**2),
-        first=fact * first,
-        acceleration=fact * (config.acceleration_m_s2 * step_s**2) ** -2.0,
-        shared=fact * shared,
-        free=free,
-    )
+    return shared
 
 
 class PathResiduals:

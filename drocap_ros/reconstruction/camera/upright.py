@@ -36,9 +36,9 @@ _GROUND_SCALE_STD = 0.04
 _BODY_STD_DEG = 5.0
 #: Angle (degrees) from the mean at which one frame's direction has half its weight.
 _LEANS_DEG = 15.0
-#: Standard deviation (m) of a resting foot's height, and frames per independent one: a foot rests for half a second.
+#: Standard deviation (m) of a resting foot's height, and independent ones per second: a foot rests for half a second.
 _FOOT_STD_M = 0.05
-_FEET_HZ = 2.0
+FEET_HZ = 2.0
 #: The same of a point of the ground, distance (m) from the feet up to which points count, and least number of them.
 _GROUND_STD_M = 0.1
 _GROUND_M = 15.0
@@ -89,11 +89,15 @@ class PathScale(NamedTuple):
 
 
 class Level(NamedTuple):
-    """Ground in the unit of a path: up (3,), height along it, and the scale at which feet stand on it."""
+    """Ground in the unit of a path: up (3,), height along it, and the scale at which feet stand on it.
+
+    spread : standard deviation of the logarithm of one frame's scale
+    """
 
     up: np.ndarray
     height: float
     scale: PathScale
+    spread: float
 
 
 class _Plane(NamedTuple):
@@ -209,7 +213,7 @@ def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np
     log = np.log(standing[fits] / above[fits])
     spread = 1.48 * float(np.median(np.abs(log - np.median(log))))
     scale = PathScale(float(np.exp(np.median(log))), max(_GROUND_SCALE_STD, 0.5 * spread))
-    return Level(normal[best], float(level[best]), scale)
+    return Level(normal[best], float(level[best]), scale, spread)
 
 
 def body_up(joints: np.ndarray) -> tuple[np.ndarray, float]:
@@ -240,7 +244,7 @@ def _by_feet(prior: _Plane, feet: np.ndarray, stamp_ns: np.ndarray) -> _Plane:
     """The plane of resting feet; frames of one rest count once."""
     weight = resting(feet, stamp_ns).reshape(-1)
     seconds = max(float(stamp_ns[-1] - stamp_ns[0]) * 1e-9, 1e-3)
-    return _fit(prior, feet.reshape(-1, 3), weight * min(_FEET_HZ * seconds / len(feet), 1.0), _FOOT_STD_M)
+    return _fit(prior, feet.reshape(-1, 3), weight * min(FEET_HZ * seconds / len(feet), 1.0), _FOOT_STD_M)
 
 
 def _by_points(plane: _Plane, feet: np.ndarray, points: np.ndarray) -> _Plane | None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.background import Background
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.observation import PoseObservation
@@ -47,6 +48,7 @@ def live_poses(
     adjuster: BundleAdjusterConfig,
     effort_at: Callable[[int], Effort | None] | None = None,
     camera_at: Callable[[np.ndarray, tuple[int, int]], WindowCamera | None] | None = None,
+    points_at: Callable[[np.ndarray], Background | None] | None = None,
 ) -> Iterator[LivePose | LiveWindow]:
     """Poses and windows in the order of the live graph; memory is that of one window.
 
@@ -57,6 +59,7 @@ def live_poses(
         window (one is skipped while another is running); without it all windows that are due, with full effort
     camera_at : gives the reported camera at the stamps (F,) of a window that is adjusted and the size (width, height)
         px of its newest image; without it none is known
+    points_at : gives the fixed points of the scene in the images of a window that is adjusted
     """
     initial, buffer, solver = LiveInitializer(initializer), FrameBuffer(adjuster), LiveAdjuster(adjuster)
     arrivals = StampValidator()  # of pose3d/initial at the adjuster's node
@@ -77,6 +80,8 @@ def live_poses(
         window = buffer.window()
         if camera_at is not None:
             window = window._replace(camera=camera_at(window.stamp_ns, observation.image_size))
+        if points_at is not None:
+            window = window._replace(background=points_at(window.stamp_ns))
         try:
             result = solver.adjust(window, effort)
         except SOLVER_ERRORS:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.background import Background
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
 
@@ -24,6 +25,7 @@ class Window(NamedTuple):
     subject : differs for every subject and for every pass of time
     camera : as reported; None = unknown
     assumed_focal_px : of the lens where the camera is unknown; None = distant
+    background : fixed points of the scene in its images; None = there are none
     """
 
     stamp_ns: np.ndarray
@@ -32,6 +34,7 @@ class Window(NamedTuple):
     subject: int = 0
     camera: WindowCamera | None = None
     assumed_focal_px: float | None = None
+    background: Background | None = None
 
     def every(self, stride: int) -> Window:
         """Every ``stride``-th frame, counted back from the newest."""
@@ -40,7 +43,9 @@ class Window(NamedTuple):
     def frames(self, use: slice) -> Window:
         """Some of the frames."""
         camera = None if self.camera is None else self.camera.frames(use)
+        kept = np.arange(len(self.stamp_ns))[use]
         return self._replace(
+            background=None if self.background is None else self.background.of_frames(kept),
             stamp_ns=self.stamp_ns[use],
             keypoints=self.keypoints[use],
             initial_joints=self.initial_joints[use],
@@ -117,6 +122,7 @@ class AdjustedWindow:
 
     effort : repeats the adjustment bit for bit
     telemetry : use of the reported camera; reason : in words, why it was refused
+    calibration : in words, the constant errors of the reports by fixed points; "" = they were not used
     """
 
     stamp_ns: np.ndarray
@@ -131,4 +137,5 @@ class AdjustedWindow:
     effort: Effort = field(default_factory=Effort)
     telemetry: TelemetryUse = TelemetryUse.NONE
     reason: str = ""
+    calibration: str = ""
     in_map: InMap | None = None

@@ -1,7 +1,4 @@
-"""Live windows in the world: the adjustment of ``world/``, with its findings as the prior of the next window.
-
-A frame's information counts once: a window hands on its share of the frames that the next one has no longer.
-"""
+"""Live windows in the world: with the reported camera in ``map``, by fixed points alone in ``odom``."""
 
 from __future__ import annotations
 
@@ -10,29 +7,33 @@ from dataclasses import replace
 
 import numpy as np
 
+from drocap_ros.background import Background
+from drocap_ros.contacts import ANKLES
 from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, with_fusion
+from drocap_ros.reconstruction.camera.upright import FEET_HZ, by_ground
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.method import WindowSolution
+from drocap_ros.reconstruction.live.fused_camera import FusedCamera
 from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, TelemetryUse, Window
+from drocap_ros.reconstruction.live.world_chain import WorldChain
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.findings import Findings
-from drocap_ros.reconstruction.world.in_world import in_world
-from drocap_ros.reconstruction.world.placement import metres_per_px
-from drocap_ros.reconstruction.world.refine import Before, RefinedWorld
+from drocap_ros.reconstruction.world.in_world import in_camera_axes
+from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
+from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.reconstruction.world.telemetry_checks import stopped, unchanged
 from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
-#: Share of a recording's steps that lock feet, and of all steps of a window that continues another, as its inverse:
-#: what more steps would change, the next window does, half a second later.
-_FEWER_STEPS = 2
 #: Time (s) for which the newest images may lack a reported pose: states of the vehicle arrive later than images.
 _LATE_S = 0.5
 #: Shorter windows (s) determine nothing: they hold no two steps of walking.
@@ -43,15 +44,11 @@ class WorldWindows:
     """Adjusts one window after the other; what was found out is forgotten with the subject."""
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
-        first = world_config(config)
-        self._first = replace(first, locking_iterations=first.locking_iterations // _FEWER_STEPS)
-        self._next = replace(self._first, iterations=first.iterations // _FEWER_STEPS)
+        self._config = world_config(config)
         self._length_ns = round(config.world_window_s * 1e9)
         self._subject: int | None = None
-        self._known = Findings.unknown()
-        #: The window before and its findings.
-        self._before: tuple[Before, Findings] | None = None
-        self._moved = False
+        self._chain, self._fused = WorldChain(), FusedCamera()
+        self._moved = self._by_points = False
         #: Whether the last window's telemetry was true: the lifter may see the camera's rotation.
         self.trusted = False
 
@@ -65,7 +62,7 @@ class WorldWindows:
         camera_result : its result in camera axes
         """
         if w.subject != self._subject:
-            self._subject, self._known, self._before = w.subject, Findings.unknown(), None
+            self._subject, self._chain, self._fused = w.subject, WorldChain(), FusedCamera()
         result = self._adjust(w, found, camera_result)
         self.trusted = result.telemetry in (TelemetryUse.USED, TelemetryUse.UNSCALED)
         return result
@@ -80,19 +77,13 @@ class WorldWindows:
         self._moved |= not unchanged(camera.rotation, camera.position).all()
         if self._moved and (refusal := stopped(camera.rotation, camera.position, stamps)):
             return self._refused(camera_result, refusal)
-        tracks = _tracks(stamps, keypoints, camera)
+        reported = _tracks(stamps, keypoints, camera, None if w.background is None else w.frames(use).background)
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
-        shape = true_shape(poses.in_image, camera.matrix)
-        per_px = metres_per_px(shape, stamps, _assumed_height(w.initial_joints))
-        known = self._prior(stamps)
-        before = self._continued(stamps)
-        config = self._first if before is None else self._next
-        _, refined, refusal = in_world(tracks, keypoints, poses, per_px, config, known, before)
-        if refusal is not None:
-            return self._refused(camera_result, refusal)
+        refined = self._refined(reported, keypoints, poses, _assumed_height(w.initial_joints))
+        if isinstance(refined, Refusal):
+            return self._refused(camera_result, refined)
         if refined is None:
             return replace(camera_result, telemetry=TelemetryUse.LATE)
-        self._known, self._before = known, (refined.before, refined.found)
         if not refined.metric:
             return replace(camera_result, telemetry=TelemetryUse.UNSCALED)
         return replace(
@@ -103,27 +94,34 @@ class WorldWindows:
             confidence=camera_result.confidence[use],
             reprojection_rms_px=camera_result.reprojection_rms_px[use],
             telemetry=TelemetryUse.USED,
-            in_map=InMap(refined.rotation, refined.position, _correction(refined, tracks)),
+            in_map=InMap(refined.rotation, refined.position, _correction(refined, reported)),
+            calibration=str(self._fused.calibration) if self._by_points else "",
         )
 
+    def _refined(
+        self, reported: Tracks, keypoints: Keypoints2D, poses: ImagePoses, height_m: float
+    ) -> RefinedWorld | Refusal | None:
+        """The window in the world, by its fixed points too where there are enough; None = too short."""
+        stamps = reported.stamp_ns
+        fused = self._fused.correct(reported, self._config)
+        if isinstance(fused, Refusal):
+            return fused
+        if self._by_points != (fused is not None):  # the camera's reports have other errors now
+            self._chain.of_scale(stamps)
+            self._by_points = fused is not None
+        tracks, config, told = reported, self._config, None
+        if fused is not None:
+            # Feet need not tell whether the reports are true: points have.
+            tracks, config = fused.tracks, replace(fused.config, checks=False)
+        per_px = metres_per_px(true_shape(poses.in_image, tracks.camera_matrix), stamps, height_m)
+        if fused is not None:
+            told = _ground(fused, poses, per_px)
+        refined = self._chain.refined(tracks, keypoints, poses, per_px, self._chain.steps(config, stamps), told)
+        return with_fusion(refined, fused) if fused is not None and isinstance(refined, RefinedWorld) else refined
+
     def _refused(self, camera_result: AdjustedWindow, refusal: Refusal) -> AdjustedWindow:
-        self._before = None
+        self._chain.begin()
         return replace(camera_result, telemetry=TelemetryUse.REFUSED, reason=str(refusal))
-
-    def _continued(self, stamps: np.ndarray) -> Before | None:
-        """The window before, where the window of these stamps shares frames with it."""
-        if self._before is None or stamps[0] > self._before[0].stamp_ns[-1]:
-            return None
-        return self._before[0]
-
-    def _prior(self, stamps: np.ndarray) -> Findings:
-        """Findings of earlier windows that the window of these stamps has not itself."""
-        if self._before is None:
-            return self._known
-        (before, *_), found = self._before
-        begin, end = int(before[0]), int(before[-1])
-        share = float(np.clip((int(stamps[0]) - begin) / max(end - begin, 1), 0.0, 1.0))
-        return self._known.later(found, share, max(int(stamps[-1]) - end, 0) * 1e-9)
 
     def _frames(self, w: Window) -> slice | None:
         """The last seconds, as far as the camera is known all the time."""
@@ -139,7 +137,9 @@ class WorldWindows:
         return slice(begin, end)
 
 
-def _tracks(stamp_ns: np.ndarray, keypoints: Keypoints2D, camera: WindowCamera) -> Tracks:
+def _tracks(
+    stamp_ns: np.ndarray, keypoints: Keypoints2D, camera: WindowCamera, background: Background | None
+) -> Tracks:
     return Tracks(
         keypoints=keypoints.xy,
         joints=BODY_17.joints,
@@ -149,7 +149,26 @@ def _tracks(stamp_ns: np.ndarray, keypoints: Keypoints2D, camera: WindowCamera) 
         camera_rotation=camera.rotation,
         camera_position=camera.position,
         camera_matrix=camera.matrix,
+        background=background,
     )
+
+
+def _ground(fused: FusedTelemetry, poses: ImagePoses, per_px: np.ndarray) -> Findings:
+    """The scale at which feet stand on the plane of points.
+
+    It errs alike in every window of a person, and is not carried on.
+    """
+    tracks, path = fused.tracks, fused.path
+    here = replace(tracks, camera_position=np.zeros((len(tracks), 3)))
+    seen = place_in_world(in_camera_axes(poses, per_px), poses.in_image[..., :2], per_px, here).joints
+    slot, fps = even_slots(tracks.stamp_ns)
+    level = by_ground(np.array([0.0, 0.0, 1.0]), seen[:, ANKLES], path.position[slot], path.points)
+    found = Findings.unknown()
+    if level is not None:
+        steps = max(FEET_HZ * len(path.position) / fps, 1.0)
+        found.precision[0, 0] = 1.0 / (level.scale.std**2 + level.spread**2 / steps)
+        found.vector[0] = np.log(level.scale.factor) * found.precision[0, 0]
+    return found
 
 
 def _correction(refined: RefinedWorld, tracks: Tracks) -> np.ndarray:

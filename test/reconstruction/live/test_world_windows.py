@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from telemetry_stream import FPS, Orbit, orbit
 
+from drocap_ros.background import Background
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.camera_history import WindowCamera
-from drocap_ros.geometry.rotations import exp_so3, quaternion_from_matrix
+from drocap_ros.geometry.rotations import exp_so3, log_so3, quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
@@ -32,9 +33,12 @@ CameraAt = Callable[[np.ndarray, tuple[int, int]], WindowCamera | None]
 
 
 def run(
-    observations: list[PoseObservation], camera_at: CameraAt, adjuster: BundleAdjusterConfig = ADJUSTER
+    observations: list[PoseObservation],
+    camera_at: CameraAt,
+    adjuster: BundleAdjusterConfig = ADJUSTER,
+    points_at: Callable[[np.ndarray], Background | None] | None = None,
 ) -> list[LivePose | LiveWindow]:
-    return list(live_poses(observations, InitializerConfig(), adjuster, camera_at=camera_at))
+    return list(live_poses(observations, InitializerConfig(), adjuster, camera_at=camera_at, points_at=points_at))
 
 
 def windows_of(results: list[LivePose | LiveWindow]) -> list[LiveWindow]:
@@ -187,6 +191,37 @@ def test_poses_that_stop_are_refused_even_when_no_window_remembers_the_motion() 
     use = [w.window.telemetry for w in windows_of(run(true.observations, history.along))]
     assert TelemetryUse.USED in use[:7]
     assert set(use[8:]) == {TelemetryUse.REFUSED}
+
+
+def test_fixed_points_measure_the_reports_and_correct_them_from_window_to_window() -> None:
+    true = flown()
+    # Pitch, yaw and roll of a cheap gimbal.
+    wrong = exp_so3(np.deg2rad([1.0, -2.0, 0.8]))
+    camera_at = replace(true, rotation=wrong @ true.rotation).history(keep_s=60.0).along
+    begin_ns = true.stamp_ns[0]
+    with_points = run(true.observations, camera_at, points_at=true.points_at)
+    without = run(true.observations, camera_at)
+    found, blind = (
+        [w for w in windows_of(results) if w.window.in_map is not None] for results in (with_points, without)
+    )
+    assert (found[0].window.stamp_ns[-1] - begin_ns) * 1e-9 < 2.5
+    assert all(w.window.calibration for w in found)
+    assert not any(w.window.calibration for w in blind)
+    last = found[-1].window
+    assert last.in_map is not None
+    at = np.searchsorted(true.stamp_ns, last.stamp_ns)
+    turned = log_so3(last.in_map.rotation @ np.swapaxes(true.rotation[at], 1, 2))
+    assert np.degrees(np.linalg.norm(turned, axis=1)).max() < 0.3
+    with_it, without_it = errors(newest(found), true), errors(newest(blind), true)
+    assert with_it.absolute_mm < 0.7 * without_it.absolute_mm
+    # Points that end leave their calibration to nobody, and their scale to the windows after them.
+    dark_ns = begin_ns + 8 * S
+
+    def until(stamp_ns: np.ndarray) -> Background | None:
+        return true.points_at(stamp_ns) if stamp_ns[-1] < dark_ns else None
+
+    after = [w.window for w in windows_of(run(true.observations, camera_at, points_at=until))]
+    assert {w.telemetry for w in after if w.stamp_ns[-1] > dark_ns} == {TelemetryUse.USED}
 
 
 def test_another_subject_starts_without_the_findings_of_the_first() -> None:
