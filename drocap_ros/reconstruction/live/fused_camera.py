@@ -64,7 +64,7 @@ class FusedCamera:
         self._last: tuple[np.ndarray, Findings] | None = None
         self.calibration: Calibration | None = None
         #: The largest errors (deg, m, deg) that points have shown, which later windows expect from the start.
-        self._shown = np.zeros(3)
+        self._shown: np.ndarray = np.zeros(3)
 
     def correct(self, tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refusal | None:
         """The window's tracks with the corrected camera; the answers are those of ``fuse_telemetry``."""
