@@ -3,8 +3,8 @@
     python -m lab.flights.false_ends --autopilot px4 --hours 10 [--first 0] [--wind 8] [--mount fixed]
 
 Each flight lasts ten minutes; the operator starts again what has ended.  Every flight prints a line: its seed, the ends
-with their codes, and how far the believed place of the subject moves within a minute: in the autopilot's map, and
-beyond the error of that map.
+with their codes, and how far the believed place of the subject moves within a minute: in the autopilot's map, beyond
+the error of that map, and so in means of 5 s, without what the estimate of a moment errs by.
 """
 
 from __future__ import annotations
@@ -25,18 +25,21 @@ _SETTLE_S = 4.0  # as the other benchmarks: link and filters
 _AGAIN_S = 3.0  # after an end, until the operator starts again
 _DRIFT_S = 60.0
 _PLACE_S = 1.0  # between the places that are compared
+_MEAN_S = 5.0  # of the means
 
 
 class Flight(NamedTuple):
     """Ends of the orbit by their codes, time in it in s, drifts in m of the believed place, one for each minute.
 
     own_m : beyond the error of the autopilot's position
+    mean_m : as ``own_m``, of means
     """
 
     ends: list[str]
     orbiting_s: float
     drifts_m: list[float]
     own_m: list[float]
+    mean_m: list[float]
 
 
 def drifts(places: np.ndarray) -> list[float]:
@@ -71,7 +74,9 @@ def fly(settings: LoopSettings) -> Flight:
     ]
     orbiting = sum(row.state == State.ORBITING for row in loop.rows) / settings.config.control_hz
     believed, error = np.array(places).transpose(1, 0, 2)
-    return Flight(ends, orbiting, drifts(believed), drifts(believed - error))
+    own, kernel = believed - error, np.full(round(_MEAN_S / _PLACE_S), _PLACE_S / _MEAN_S)
+    means = np.stack([np.convolve(axis, kernel, "valid") for axis in own.T], axis=1)
+    return Flight(ends, orbiting, drifts(believed), drifts(own), drifts(means))
 
 
 def _words(drifts_m: list[float]) -> str:
@@ -95,11 +100,12 @@ def main() -> int:
         )
         flight = fly(settings)
         flights.append(flight)
-        print(seed, ", ".join(flight.ends) or "no end", _words(flight.drifts_m), _words(flight.own_m), sep="  ")
+        print(seed, ", ".join(flight.ends) or "no end", *map(_words, flight[2:]), sep="  ")
     ends = sum(len(flight.ends) for flight in flights)
     hours = sum(flight.orbiting_s for flight in flights) / 3600
-    moved, own = [m for flight in flights for m in flight.drifts_m], [m for flight in flights for m in flight.own_m]
+    moved, own, mean = ([m for part in parts for m in part] for parts in list(zip(*flights, strict=True))[2:])
     print(f"{args.autopilot}: {ends} ends in {hours:.2f} h of orbit; moved {_words(moved)}; by itself {_words(own)}")
+    print(f"means of {_MEAN_S:g} s: {_words(mean)}")
     return 1 if ends else 0
 
 
