@@ -29,40 +29,56 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--video", metavar="VIDEO", type=Path, help="video, image folder or recording of MOTION, for its images"
     )
+    parser.add_argument(
+        "--mp4", action="store_true", help="also write the video beside the body in 3D, H.264, beside the page"
+    )
     add_quiet_option(parser, "no output, only errors")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the report."""
+    """Write the report, and the video beside it."""
     from drocap_ros.cli.atomic_output import output_file
     from drocap_ros.report.page import save_report
 
     path, motion = read_motion(args.motion)
     out = args.out or path.with_name("report.html")
-    places = [] if args.video else _places(path, str(motion.meta.get("input", "")))
-    with output_file(out, inputs=[path, args.video, *places]) as file:
-        found = _save_with_images(file, motion, places, args.command_line)
-        if not found:
-            former = next((page for page in (out, path.with_name("report.html")) if page.exists()), None)
-            kept = save_report(file, motion, video=args.video, former=former, command=args.command_line)
+    places = [args.video] if args.video else _places(path, str(motion.meta.get("input", "")))
+    video = args.video or _own_video(motion, places)
+    looked = f"no video of this motion as {', '.join(map(str, places))}; name it: --video FILE"
+    if args.mp4 and video is None:
+        raise InputError(f"--mp4: expected the motion's images, found {looked}")
+    with output_file(out, inputs=[path, *places]) as file:
+        former = next((page for page in (out, path.with_name("report.html")) if page.exists()), None)
+        shown = save_report(file, motion, video=video, former=former, command=args.command_line)
+        mp4 = [_save_mp4(out.with_suffix(".mp4"), motion, video, args.quiet)] if args.mp4 and video else []
     if not args.quiet:
-        if places and not found:
-            words = "kept the images of the report before" if kept else "without images"
-            print(f"{words}: no video of this motion as {', '.join(map(str, places))}; name it: --video FILE")
-        print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)\n{open_words(out)}")
+        if places and video is None:
+            print(f"{'kept the images of the report before' if shown else 'without images'}: {looked}")
+        print("".join(f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)\n" for file in (out, *mp4)), end="")
+        print(open_words(out))
     return 0
 
 
-def _save_with_images(file: Path, motion: Motion, places: Sequence[Path], command: str) -> bool:
-    """Whether a video at one of the places is that of the motion; the report is then written."""
-    from drocap_ros.report.motion_images import has_images
-    from drocap_ros.report.page import save_report
+def _own_video(motion: Motion, places: Sequence[Path]) -> Path | None:
+    """The first of the places with images of the motion; None = there is none."""
+    from drocap_ros.report.motion_images import each_image, has_images
 
-    for video in places:
+    for place in places:
         with contextlib.suppress(InputError):  # another video of that name
-            if video.exists() and has_images(video):
-                return save_report(file, motion, video=video, command=command)
-    return False
+            if place.exists() and has_images(place):
+                next(each_image(place, motion))
+                return place
+    return None
+
+
+def _save_mp4(out: Path, motion: Motion, video: Path, quiet: bool) -> Path:
+    from drocap_ros.cli.atomic_output import output_file
+    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.report.side_by_side import save_side_by_side
+
+    with output_file(out, inputs=[video], option="--mp4") as file, progress_bars(quiet) as progress:
+        save_side_by_side(file, motion, video, progress)
+    return out
 
 
 def _places(motion: Path, name: str) -> list[Path]:

@@ -17,12 +17,9 @@ from drocap_ros.cli.options import (
     add_threads_option,
     clip_of,
 )
-from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
-    import cv2
-    import numpy as np
-
     from drocap_ros.clip import Progress
     from drocap_ros.config import DrocapConfig
     from drocap_ros.observation import PoseObservation
@@ -81,7 +78,8 @@ def run(args: argparse.Namespace) -> int:
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
         text = write(args, config, folder, Selection(clip_of(args), person, topic=args.topic), target, progress)
     if not args.quiet:
-        print(f"{text}\nwritten: {out}/{'persons.jpg' if args.list else 'tracks.npz'}")
+        names = "persons.jpg" if args.list else "tracks.npz, overlay.mp4" if args.overlay else "tracks.npz"
+        print(f"{text}\nwritten: {out}/{names}")
     return 0
 
 
@@ -126,13 +124,14 @@ def _track(
     from drocap_ros.perception.sources.base import in_order
     from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
     from drocap_ros.pipeline import follow_selected
+    from drocap_ros.report.overlay import OverlayVideo
     from drocap_ros.tracks import save_tracks
 
     settings, begin_ns = follow_selected(args.video, config, models, selection, progress)
     estimator = PoseEstimator(models, settings)
     with open_images(args.video, config.image_ingest, args.topic) as images, contextlib.ExitStack() as stack:
-        overlay = _OverlayWriter(target / "overlay.mp4", images.rate_hz, args.points) if args.overlay else None
-        draw = stack.enter_context(in_order(overlay.add)) if overlay is not None else None
+        drawn = OverlayVideo(target / "overlay.mp4", images.rate_hz, with_points=args.points)
+        draw = stack.enter_context(in_order(stack.enter_context(drawn).add)) if args.overlay else None
         meter = selection.clip.meter(progress, "2D pose", images.duration_s)
 
         def on_frame(frame: Frame, observation: PoseObservation) -> None:
@@ -142,8 +141,6 @@ def _track(
 
         frames = selection.clip.select(images.frames)
         observations = observe(frames, estimator, on_frame, begin_ns, args.threads)
-    if overlay is not None:
-        overlay.close()
     tracks_from_observations(observations)  # raises for a recording without a person
     found = subjects(observations)
     for rank, (track_id, _) in enumerate(found):
@@ -151,72 +148,15 @@ def _track(
         save_tracks(target / name, tracks_from_observations(observations, track_id))
     begin = observations[0].stamp_ns
     changes = [f"{(stamp_ns - begin) * 1e-9:.1f} s: {text}" for stamp_ns, text in estimator.tracker.changes]
-    return "\n".join([_summary(found, len(observations)), *changes[1:]])
+    return "\n".join([_summary(found, len(observations)), *changes[1:], *_overlay_words(drawn.codec)])
 
 
-class _OverlayWriter:
-    """Writes the video with the subject drawn, at the given rate; without one, at that of its first two frames."""
+def _overlay_words(codec: str) -> list[str]:
+    """A line about the codec where browsers do not play it; no codec = no video."""
+    from drocap_ros.report.video_file import install_words
 
-    def __init__(self, path: Path, rate_hz: float | None, with_points: bool = False) -> None:
-        from drocap_ros.report.overlay import Trails
-
-        self._path, self._rate_hz, self._count = path, rate_hz, 0
-        self._trails = Trails() if with_points else None
-        self._first: tuple[int, np.ndarray] | None = None
-        self._video: cv2.VideoWriter | None = None
-
-    def add(self, frame: Frame, observation: PoseObservation) -> None:
-        import cv2
-
-        from drocap_ros.report.overlay import draw
-
-        height, width = frame.image.shape[:2]
-        scale = min(1.0, 1280 / max(width, height))
-        size = (max(2, round(width * scale) // 2 * 2), max(2, round(height * scale) // 2 * 2))
-        below = frame.image if self._trails is None else self._trails.draw(frame.image, observation)
-        image = cv2.resize(draw(below, observation), size, interpolation=cv2.INTER_AREA)
-        if self._first is None:
-            self._first = frame.stamp_ns, image
-            return
-        if self._video is None:
-            self._open(self._rate_hz or 1e9 / (frame.stamp_ns - self._first[0]))
-        self._write(image)
-
-    def close(self) -> None:
-        if self._video is None and self._first is not None:  # a single image
-            self._open(1.0)
-        if self._video is not None:
-            self._video.release()
-            self._check()
-
-    def _write(self, image: np.ndarray) -> None:
-        assert self._video is not None
-        self._video.write(image)
-        self._count += 1
-
-    def _check(self) -> None:
-        """The writer reports no error: a full disk leaves a file without its end."""
-        import cv2
-
-        video = cv2.VideoCapture(str(self._path))
-        found = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
-        video.release()
-        if found < self._count:
-            raise self._failed()
-
-    def _failed(self) -> DrocapError:
-        return DrocapError(f"{self._path.name}: the video could not be written; check the space on the disk")
-
-    def _open(self, rate_hz: float) -> None:
-        import cv2
-
-        assert self._first is not None
-        rate_hz, image = min(max(rate_hz, 1.0), 120.0), self._first[1]
-        size = (image.shape[1], image.shape[0])
-        self._video = cv2.VideoWriter(str(self._path), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, size)
-        if not self._video.isOpened():
-            raise self._failed()
-        self._write(self._first[1])
+    plays = not codec or codec == "H.264"
+    return [] if plays else [f"overlay.mp4 is {codec}, which browsers do not play; for H.264 run {install_words()}"]
 
 
 def _summary(found: list[tuple[int, int]], frames: int) -> str:

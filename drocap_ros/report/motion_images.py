@@ -231,7 +231,7 @@ class _Encoder:
 
     def __init__(self, motion: Motion, shape: tuple[int, ...], count: int) -> None:
         height, width = shape[:2]
-        self.box = _crop(motion.keypoints, width, height)
+        self.box = subject_box(motion.keypoints, width, height)
         x0, y0, x1, y1 = self.box
         scale = min(1.0, _LONG_SIDE / max(x1 - x0, y1 - y0))
         self._size = (max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale)))
@@ -262,8 +262,8 @@ class _Encoder:
         return cv2.imencode(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def _crop(keypoints: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:
-    """Bounding box of the subject over all frames, without outliers, with a margin; the whole image if unknown."""
+def subject_box(keypoints: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:
+    """Box x_min, y_min, x_max, y_max px of the subject in all frames, with a margin; the whole image if unknown."""
     known = keypoints[np.isfinite(keypoints).all(axis=2)]
     if len(known) < 4:
         return 0, 0, width, height

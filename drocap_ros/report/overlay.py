@@ -1,16 +1,19 @@
-"""Overlay of the subject on an image, and the picture of all persons with their numbers."""
+"""Overlay of the subject on images and its video, and the picture of all persons with their numbers."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
 from functools import partial
+from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.persons import FoundPerson
 from drocap_ros.perception.sources.base import Frame
+from drocap_ros.report.video_file import VideoFile
 from drocap_ros.skeleton import side_of
 
 #: BGR; the sides as in the markers and the viewer.
@@ -23,6 +26,8 @@ _POINT, _TRAIL, _TRAIL_NS = (255, 0, 255), (210, 90, 210), 1_000_000_000
 _MOST_IMAGES = 12
 #: Largest width of each, px.
 _WIDTH_PX = 960
+#: Longer side of the overlay's video, px.
+_VIDEO_PX = 1280
 
 
 def draw(image: np.ndarray, observation: PoseObservation) -> np.ndarray:
@@ -79,6 +84,56 @@ class Trails:
             radius = 2 * line_px if len(way) > 1 else line_px
             cv2.circle(out, tuple(np.round(point).astype(int).tolist()), radius, _POINT, -1, cv2.LINE_AA)
         return out
+
+
+class OverlayVideo:
+    """The video with the subject drawn, at a rate in images/s; without one, at that of its first two frames.
+
+    A context manager, which closes the file.
+    """
+
+    def __init__(self, path: Path, rate_hz: float | None, *, with_points: bool = False) -> None:
+        self._path, self._rate_hz = path, rate_hz
+        self._trails = Trails() if with_points else None
+        self._first: tuple[int, np.ndarray] | None = None
+        self._video: VideoFile | None = None
+
+    @property
+    def codec(self) -> str:
+        """H.264 or MPEG-4; empty before the second frame."""
+        return self._video.codec if self._video else ""
+
+    def add(self, frame: Frame, observation: PoseObservation) -> None:
+        """Draw a frame and append it."""
+        import cv2
+
+        height, width = frame.image.shape[:2]
+        scale = min(1.0, _VIDEO_PX / max(width, height))
+        size = (max(2, round(width * scale) // 2 * 2), max(2, round(height * scale) // 2 * 2))
+        below = frame.image if self._trails is None else self._trails.draw(frame.image, observation)
+        image = cv2.resize(draw(below, observation), size, interpolation=cv2.INTER_AREA)
+        if self._first is None:
+            self._first = frame.stamp_ns, image
+        elif self._video is None:
+            self._open(self._rate_hz or 1e9 / (frame.stamp_ns - self._first[0])).write(image)
+        else:
+            self._video.write(image)
+
+    def _open(self, rate_hz: float) -> VideoFile:
+        assert self._first is not None
+        image = self._first[1]
+        self._video = VideoFile(self._path, (image.shape[1], image.shape[0]), rate_hz)
+        self._video.write(image)
+        return self._video
+
+    def __enter__(self) -> OverlayVideo:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if kind is None and self._video is None and self._first is not None:
+            self._open(1.0)  # a single image
+        if self._video is not None:
+            self._video.__exit__(kind, error, at)
 
 
 def draw_numbers(image: np.ndarray, boxes: dict[int, np.ndarray], title: str) -> np.ndarray:

@@ -6,10 +6,12 @@ import re
 import cv2
 import numpy as np
 import pytest
+from encoders import with_ffmpeg, without_ffmpeg
 from refusals import refused
 
 from drocap_ros.cli import main
 from drocap_ros.motion import load_motion, save_motion
+from drocap_ros.report.motion_images import subject_box
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.tracks import save_tracks
 
@@ -78,6 +80,46 @@ def test_a_report_keeps_its_images_when_the_video_has_moved(person, folder, caps
 
 def images_in(page):
     return re.findall(r'"(/9j/[^"]*)"', page.read_text())
+
+
+def test_mp4_shows_the_video_with_the_body_beside_the_body_in_3d(person, folder, capsys, monkeypatch, tmp_path_factory):
+    codec = with_ffmpeg(tmp_path_factory.mktemp("programs") / "bin", monkeypatch)
+    save_motion(folder / "motion.npz", dataclasses.replace(person, meta={**person.meta, "input": "clip.avi"}))
+    write_video(folder / "clip.avi", person, own_rate_hz(person))
+    assert main(["report", str(folder), "--mp4"]) == 0
+    assert f"written: {folder}/report.mp4" in capsys.readouterr().out
+    assert sorted(path.name for path in folder.iterdir()) == ["clip.avi", "motion.npz", "report.html", "report.mp4"]
+    video = cv2.VideoCapture(str(folder / "report.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode() == codec
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 60
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(own_rate_hz(person), rel=1e-3)
+    frame = 30
+    video.set(cv2.CAP_PROP_POS_FRAMES, frame)
+    picture = video.read()[1].astype(int)
+    # Left: white joints on the grey video, each at its keypoint.
+    width = picture.shape[1] - 720
+    x0, y0, x1, y1 = subject_box(
+        person.keypoints, *(int(side) + 20 for side in np.nanmax(person.keypoints, axis=(0, 1)))
+    )
+    scale = min(width / (x1 - x0), 720 / (y1 - y0))
+    middle = 0.5 * np.array([x0 + x1, y0 + y1])
+    for x, y in np.round((person.keypoints[frame] - middle) * scale + [width / 2, 360]).astype(int):
+        assert picture[y - 1 : y + 2, x - 1 : x + 2].min() > 180
+    # Right: the body, 2.24 m of the world in 720 px; its left side is blue, and here in front of the red one.
+    blue, _, red = np.moveaxis(picture[:, width:], -1, 0)
+    left = [place for place, name in enumerate(person.joints) if name.startswith("l")]
+    tall_m = np.ptp(person.joints3d[frame, left, 2])
+    rows = np.flatnonzero((blue - red > 60).any(axis=1))
+    assert np.ptp(rows) == pytest.approx(tall_m * 720 / 2.24, rel=0.2)
+    assert (red - blue > 60).sum() > 1000
+
+
+def test_mp4_without_ffmpeg_or_images_says_what_to_do(person, folder, capsys, monkeypatch):
+    refused(["report", folder, "--mp4"], folder, capsys, "name it: --video FILE")
+    write_video(folder / "clip.avi", person, own_rate_hz(person))
+    without_ffmpeg(monkeypatch)
+    words = ["report", folder, "--mp4", "--video", folder / "clip.avi"]
+    refused(words, folder, capsys, "-m pip install imageio-ffmpeg")
 
 
 def test_what_cannot_be_shown_is_refused(person, folder, capsys):

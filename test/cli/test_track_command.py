@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from encoders import with_ffmpeg, without_ffmpeg
 from rendered_person import rendered_images
 
 from drocap_ros.cli import main
-from drocap_ros.cli.track import _OverlayWriter
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.sources import Frame
+from drocap_ros.report.overlay import OverlayVideo
 from drocap_ros.tracks import load_tracks
 
 
@@ -233,12 +234,31 @@ def test_a_full_disk_is_named_and_leaves_no_picture_or_video(tmp_path, option, l
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_overlay_is_named_and_h264_where_ffmpeg_is(tmp_path, capsys, monkeypatch, there):
+    cv2 = pytest.importorskip("cv2")
+    (tmp_path / "images").mkdir()
+    for number, image in enumerate(rendered_images(4)):
+        cv2.imwrite(str(tmp_path / "images" / f"{number}.jpg"), image)
+    codec = with_ffmpeg(tmp_path / "bin", monkeypatch) if there else "FMP4"
+    if not there:
+        without_ffmpeg(monkeypatch)
+    out = tmp_path / "out"
+    words = ["track", str(tmp_path / "images"), "--models", "simulation", "--overlay", "--out", str(out)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert said.endswith(f"written: {out}/tracks.npz, overlay.mp4\n")
+    assert ("pip install imageio-ffmpeg" in said) is not there
+    video = cv2.VideoCapture(str(out / "overlay.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode() == codec
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 4
+
+
 def test_overlay_has_the_rate_of_the_video_not_of_its_first_two_images(tmp_path):
     cv2 = pytest.importorskip("cv2")
-    overlay = _OverlayWriter(tmp_path / "overlay.mp4", 20.0)
-    for stamp in (0, 100_000_000, 150_000_000):
-        overlay.add(Frame(stamp, np.zeros((48, 64, 3), np.uint8)), PoseObservation(stamp, 0, (64, 48)))
-    overlay.close()
+    with OverlayVideo(tmp_path / "overlay.mp4", 20.0) as overlay:
+        for stamp in (0, 100_000_000, 150_000_000):
+            overlay.add(Frame(stamp, np.zeros((48, 64, 3), np.uint8)), PoseObservation(stamp, 0, (64, 48)))
     assert cv2.VideoCapture(str(tmp_path / "overlay.mp4")).get(cv2.CAP_PROP_FPS) == pytest.approx(20.0)
 
 
