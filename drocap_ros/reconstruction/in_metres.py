@@ -13,6 +13,7 @@ from drocap_ros.reconstruction.camera.picture_world import PictureWorld, at_assu
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.common.spread import packed
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
 from drocap_ros.reconstruction.person_view import true_shape
@@ -164,14 +165,12 @@ def _with_camera_of(source: Source, refined: RefinedWorld) -> RefinedWorld:
 
 
 def _covariance(poses: ImagePoses, per_px: np.ndarray, rotation: np.ndarray) -> np.ndarray | None:
-    """(F, P, 6) m^2 about the pelvis of the expected errors across and along the ray; rotation is world -> camera."""
+    """(F, P, 6) m^2 about the pelvis; rotation (F, 3, 3) is world -> camera."""
     if poses.sigma_px is None:
         return None
-    std = poses.sigma_px * per_px[:, None, None] * np.array(poses.std_over_sigma)
-    variance = np.square(std)[..., [0, 0, 1]]
-    full = np.einsum("fki,fpk,fkj->fpij", rotation, variance, rotation)
-    packed: np.ndarray = full[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    return packed
+    metres = per_px[:, None, None]
+    full = poses.spread.covariance(poses.in_image * metres, poses.sigma_px * metres)
+    return packed(np.swapaxes(rotation, 1, 2)[:, None] @ full @ rotation[:, None])
 
 
 def reprojection_px(

@@ -11,6 +11,7 @@ import numpy as np
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.evidence import Evidence
+from drocap_ros.reconstruction.common.spread import Spread
 from drocap_ros.reconstruction.common.stop_reason import NO_ADJUSTMENT
 
 Progress = Callable[[str, float], None]
@@ -72,14 +73,14 @@ class ImagePoses:
     translation_px : (F, 2)
     sigma_px : (F, P, 2) expected absolute error of x, y (each) and of depth; None = the method has none
     still : (F, 2) probability that the right and the left foot rest in the world; None = the method has none
-    std_over_sigma : (2,) standard deviation of a pose about its pelvis over ``sigma_px``, across and along the ray
+    spread : of the poses about their pelvis
     """
 
     joints_px: np.ndarray
     translation_px: np.ndarray
     sigma_px: np.ndarray | None = None
     still: np.ndarray | None = None
-    std_over_sigma: tuple[float, float] = (1.0, 1.0)
+    spread: Spread = field(default_factory=Spread)
     report: Report = field(default_factory=Report)
 
     @staticmethod

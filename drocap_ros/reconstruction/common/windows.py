@@ -28,7 +28,7 @@ def over_windows(data: MethodInput, solve: Callable[[slice], ImagePoses]) -> Ima
         reports.append(found.report)
         data.progress("ba", rows.stop / frames)
     mean = {name: total / _along(weight, total) for name, total in faded.items()}
-    return replace(ImagePoses.centred(**mean), std_over_sigma=found.std_over_sigma, report=_together(reports))
+    return replace(ImagePoses.centred(**mean), spread=found.spread, report=_together(reports))
 
 
 def _along(per_frame: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.reconstruction.common.spread import Spread
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, LIFTER_FPS, mirrored, normalise
 from drocap_ros.reconstruction.lifted.network import Errors, LiftedMotion, LifterInput
 from drocap_ros.skeleton import BODY_17
@@ -30,7 +31,7 @@ class FeatureNetwork:
 
     fps, slowest, fastest = LIFTER_FPS, 0.7, 1.4
     window, overlap = 240, 80
-    errors = Errors(adjusted=(1.3, 2.2), newest=(1.45, 2.2), lasting=1.2)
+    errors = Errors(adjusted=Spread(1.3, 1.2, size=0.024, lean=0.07), newest=(1.45, 2.2), lasting=1.2)
 
     def __init__(self, session: InferenceSession, path: str) -> None:
         """From an onnxruntime session; an ``InputError`` names the file where the network is another."""

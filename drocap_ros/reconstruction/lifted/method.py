@@ -18,6 +18,7 @@ import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.evidence import Evidence
+from drocap_ros.reconstruction.common.spread import Spread
 from drocap_ros.reconstruction.lifted.body_size import (
     YARDSTICK,
     YARDSTICK_MM,
@@ -60,7 +61,7 @@ class WindowSolution:
         pelvis
     sigma : (F, 17, 2) expected absolute error of x, y (each) and of depth, in the same unit: the lifter's and, for
         keypoints without a covariance, their noise that lasts for some frames
-    std_over_sigma : standard deviation of a pose about its pelvis over sigma, across and along the ray
+    spread : of the poses about their pelvis
     still : (F, 2) the lifter's probability that the right and the left foot rest in the world
     body : the size for the next window
     steps : of the first and of the final adjustment
@@ -69,7 +70,7 @@ class WindowSolution:
 
     joints: np.ndarray
     sigma: np.ndarray
-    std_over_sigma: tuple[float, float]
+    spread: Spread
     still: np.ndarray
     body: BodySize
     cost_terms: dict[str, float]
@@ -158,7 +159,7 @@ def solve_even_window(  # noqa: PLR0913 - what is known of camera, body and dept
     return WindowSolution(
         joints=joints,
         sigma=sigma,
-        std_over_sigma=lifter.errors.adjusted,
+        spread=lifter.errors.adjusted,
         still=sized.lifted.still,
         body=BodySize(found.lengths * yardstick, zoom * found.zoom / (mm * yardstick)),
         cost_terms=found.cost_terms,

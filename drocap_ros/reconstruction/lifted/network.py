@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from drocap_ros.geometry.rotations import exp_so3, log_so3
+from drocap_ros.reconstruction.common.spread import Spread
 
 
 @dataclass(frozen=True)
@@ -94,12 +95,13 @@ class LifterInput:
 class Errors:
     """True errors of a network's poses, measured on sequences that it was not trained on.
 
-    adjusted, newest : standard deviation of a pose about its pelvis over the expected absolute error, across and along
-        the ray: after the adjustment of a window, and of the newest image of a stream as lifted
+    adjusted : of poses about their pelvis, after the adjustment of a window
+    newest : standard deviation over the expected absolute error, across and along the ray, of the newest image of a
+        stream as lifted
     lasting : share of the keypoints' lasting noise in the errors across the ray, for keypoints without a covariance
     """
 
-    adjusted: tuple[float, float]
+    adjusted: Spread
     newest: tuple[float, float]
     lasting: float
 

@@ -13,6 +13,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
+from drocap_ros.reconstruction.common.spread import packed
 from drocap_ros.reconstruction.common.stop_reason import DEADLINE
 from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
@@ -146,8 +147,7 @@ def _turned_back(result: AdjustedWindow, turn: np.ndarray) -> AdjustedWindow:
     """Poses in the axes of a view, ``turn`` (F, 3, 3) camera -> view, in those of the camera."""
     back = turn[:, None]
     full = np.swapaxes(back, -1, -2) @ unpack_covariance(result.covariance) @ back
-    covariance = full[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    return replace(result, joints3d=result.joints3d @ turn, covariance=covariance)
+    return replace(result, joints3d=result.joints3d @ turn, covariance=packed(full))
 
 
 def _adjusted(w: Window, found: WindowSolution, focal: float | None, effort: Effort) -> AdjustedWindow:
@@ -166,13 +166,11 @@ def _adjusted(w: Window, found: WindowSolution, focal: float | None, effort: Eff
         raise InputError("initial_joints: expected a pose in at least one frame, got NaN in all; check the 2D joints")
     # The scale of a monocular result is that of the initial poses: keep the mean limb length.
     metres = float(limb_lengths(w.initial_joints[known]).mean() / limb_lengths(joints).mean())
-    std = found.sigma / found.body.unit_per_mm[:, None, None] * np.array(found.std_over_sigma) * metres
-    covariance = np.zeros((*joints.shape[:2], 6))
-    covariance[..., [0, 3, 5]] = std[..., [0, 0, 1]] ** 2
+    sigma = found.sigma / found.body.unit_per_mm[:, None, None] * metres
     return AdjustedWindow(
         stamp_ns=np.asarray(w.stamp_ns, dtype=np.int64),
         joints3d=joints * metres,
-        covariance=covariance,
+        covariance=packed(found.spread.covariance(joints * metres, sigma)),
         confidence=np.where(seen, confidence, 0.0),
         reprojection_rms_px=np.where(seen.any(axis=1), rms, np.nan),
         iterations=sum(found.steps),

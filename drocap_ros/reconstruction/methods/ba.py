@@ -33,6 +33,6 @@ def run(data: MethodInput) -> ImagePoses:
         joints[..., :2] += middle[:, None]
         report = Report(found.steps[1], found.stop_reason, found.cost_terms, found.seconds, origin)
         poses = ImagePoses.uncentred(joints, report)
-        return replace(poses, sigma_px=found.sigma, still=found.still, std_over_sigma=found.std_over_sigma)
+        return replace(poses, sigma_px=found.sigma, still=found.still, spread=found.spread)
 
     return over_windows(data, solve)
