@@ -13,14 +13,11 @@ recording_PART of docs/figures.
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import json
 import os
 import random
 import resource
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -30,11 +27,11 @@ from pathlib import Path
 from typing import Any
 
 from figures import ROOT, table, write_figures
+from mutated_files import KINDS, mutations
 from recorder_load import make_sources, process_usage, publish_all, watch_process
 
 sys.path[:0] = [str(ROOT), str(ROOT / "test" / "helpers")]
 PARTS = ("load", "kills", "mutations", "long", "live")
-KINDS = ("mcap", "npz", "tlog", "srt", "bin", "ulg", "csv", "mp4")
 
 
 def main() -> int:
@@ -56,6 +53,18 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="drocap_bench_") as folder:
             globals()[f"part_{part}"](args, Path(folder))
     return 0
+
+
+def part_mutations(args: argparse.Namespace, folder: Path) -> None:
+    results = {kind: cell("mutations", kind, args.mutations, args.seed, folder) for kind in args.kinds}
+    head = ("format", "copies", "used", "refused", "faults", "longest, s", "memory, MiB", "memory at the start, MiB")
+    rows = [(kind, *list(result.values())[:4], *list(result.values())[5:]) for kind, result in results.items()]
+    faults = [f"- {kind} {fault}" for kind, result in results.items() for fault in result["examples"]]
+    text = table(head, rows) + "\n" + "\n".join(faults)
+    if tuple(args.kinds) == tuple(KINDS):
+        write_figures("recording_mutations", "Mutated files", text)
+    else:
+        print(text)
 
 
 def cell(*words: object) -> dict[str, Any]:
@@ -154,122 +163,6 @@ def part_kills(args: argparse.Namespace, folder: Path) -> None:
     )
 
 
-# -- mutations ---------------------------------------------------------------------------------------------
-
-
-def part_mutations(args: argparse.Namespace, folder: Path) -> None:
-    results = {kind: cell("mutations", kind, args.mutations, args.seed, folder) for kind in args.kinds}
-    head = ("format", "copies", "used", "refused", "faults", "longest, s", "memory, MiB", "memory at the start, MiB")
-    rows = [(kind, *list(result.values())[:4], *list(result.values())[5:]) for kind, result in results.items()]
-    faults = [f"- {kind} {fault}" for kind, result in results.items() for fault in result["examples"]]
-    text = table(head, rows) + "\n" + "\n".join(faults)
-    if tuple(args.kinds) == KINDS:
-        write_figures("recording_mutations", "Mutated files", text)
-    else:
-        print(text)
-
-
-def cell_mutations(kind: str, count: str, seed: str, folder: str) -> dict[str, Any]:
-    from djmd_clips import damaged_boxes
-    from telemetry_logs import mutated
-
-    whole = whole_file(kind, Path(folder))
-    rng = random.Random(f"{seed} {kind}")
-    path = Path(folder) / f"mutated.{kind}"
-    base_mib = peak_mib()
-    refused = used = 0
-    worst_s, faults = 0.0, []
-    signal.signal(signal.SIGALRM, _too_long)
-    for i in range(int(count)):
-        # Every other copy of a video has a box that lies; else damage would mostly hit its images.
-        path.write_bytes(damaged_boxes(whole, rng) if kind == "mp4" and i % 2 else mutated(whole, rng))
-        begin = time.monotonic()
-        signal.setitimer(signal.ITIMER_REAL, 10.0)
-        try:
-            status, words = use(kind, path)
-        except BaseException as error:  # noqa: BLE001 - every end counts, the alarm's too
-            status, words = 1, f"{type(error).__name__}: {error}"
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-        worst_s = max(worst_s, time.monotonic() - begin)
-        used, refused = used + (status == 0), refused + (status == 2)
-        if status not in (0, 2) or "Traceback" in words or (status == 2 and len(words.strip().splitlines()) > 1):
-            faults.append(f"{i}: {words.strip()[:200]}")
-            shutil.copy(path, Path(tempfile.gettempdir()) / f"drocap_fault_{i}.{kind}")
-    return {
-        "copies": int(count), "used": used, "refused": refused, "faults": len(faults), "examples": faults[:5],
-        "worst_s": round(worst_s, 2), "peak_mib": round(peak_mib()), "base_mib": round(base_mib),
-    }  # fmt: skip
-
-
-def _too_long(*_: object) -> None:
-    raise TimeoutError("longer than 10 s")
-
-
-def use(kind: str, path: Path) -> tuple[int, str]:
-    """Exit status of a command for the file, and its text on stderr."""
-    from drocap_ros.cli import main as drocap
-    from drocap_ros.config import DrocapConfig
-    from drocap_ros.errors import InputError
-    from drocap_ros.pipeline import read_input
-    from drocap_ros.recording.telemetry.camera_poses import camera_poses
-    from drocap_ros.recording.telemetry.read import read_telemetry
-
-    said, out = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(out):
-        try:
-            status = drocap(["info", str(path)]) if kind in ("mcap", "npz", "mp4") else 0
-            if status == 0:
-                said.seek(0)
-                said.truncate(0)
-            if status == 0 and kind in ("mcap", "npz"):
-                read_input(path, DrocapConfig(), None)
-            elif status == 0:
-                log = read_telemetry(path)
-                camera_poses(log.track, log.track.stamp_ns[:100])
-        except InputError as error:
-            said.write(f"{error}\n")
-            status = 2
-    return status, said.getvalue()
-
-
-def whole_file(kind: str, folder: Path) -> bytes:
-    import numpy as np
-    from airdata_tables import write_airdata
-    from dataflash import write_dataflash
-    from djmd_clips import whole_clip
-    from recorded import START_NS, Messages, write_poses
-    from telemetry_logs import dji_subtitle, srt_text
-
-    from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
-    from drocap_ros.simulation.capture import simulate_capture
-    from drocap_ros.tracks import save_tracks
-
-    media = ROOT.parent / "shared" / "media"
-    t = np.arange(0, 8, 0.05).round(3)
-    angles = np.stack([0.1 * np.sin(t), 0.05 * np.cos(t), 0.4 * t - 1], axis=1)
-    geodetic = np.stack([47 + 1e-5 * np.sin(t), 8 + 1e-5 * np.cos(t), 500 + 0.5 * t], axis=1)
-    if kind == "tlog":
-        return (media / "arduplane_vtol_sitl.tlog").read_bytes()[:200_000]
-    if kind == "ulg":
-        return (media / "px4_sample_small.ulg").read_bytes()[:300_000]
-    if kind == "srt":
-        return srt_text(
-            t, [dji_subtitle(i, g, a) for i, (g, a) in enumerate(zip(geodetic, angles, strict=True))]
-        ).encode()
-    if kind == "csv":
-        return write_airdata(folder / "whole.csv", [(1.0, 7.0)]).read_bytes()
-    if kind == "mp4":
-        return whole_clip(folder / "whole.mp4").read_bytes()
-    if kind == "bin":
-        return write_dataflash(folder / "whole.bin", t, angles, geodetic, angles).read_bytes()
-    tracks = simulate_capture(4, 30, seed=2, start_ns=START_NS).tracks
-    if kind == "npz":
-        save_tracks(folder / "whole.npz", tracks)
-        return (folder / "whole.npz").read_bytes()
-    return write_poses(folder / "s", Messages(), tracks, SessionRecorderConfig(chunk_kib=16)).read_bytes()
-
-
 # -- long sessions -----------------------------------------------------------------------------------------
 
 
@@ -364,7 +257,7 @@ def part_live(args: argparse.Namespace, folder: Path) -> None:
     )
 
 
-CELLS = {"mutations": cell_mutations, "write_long": cell_write_long, "long": cell_long}
+CELLS = {"mutations": mutations, "write_long": cell_write_long, "long": cell_long}
 
 if __name__ == "__main__":
     raise SystemExit(main())

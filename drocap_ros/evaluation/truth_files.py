@@ -107,7 +107,7 @@ def body_joints(names: list[str]) -> dict[str, int]:
 def _on_the_body(path: Path, points: _Points) -> tuple[np.ndarray, np.ndarray]:
     found = body_joints(points.names)
     if missing := [joint for joint in LIMB_JOINTS if joint not in found]:
-        there = ", ".join(points.names[:40]) or "none"
+        there = ", ".join(re.sub(r"[^ -~]", "?", name)[:30] for name in points.names[:20]) or "none"
         raise InputError(f"expected joints by names, found no {', '.join(missing)} among {there}; rename the joints")
     x = in_body_order(points.positions[:, list(found.values())].astype(np.float64), list(found), LIMB_JOINTS)
     x[~np.isfinite(x).all(axis=2)] = np.nan
