@@ -7,14 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
-from drocap_ros.reconstruction.world.world_equations import WIDTH
-from drocap_ros.reconstruction.world.world_model import CAMERA, FRAME, GLOBALS, JOINTS, SCALE, WorldState
+from drocap_ros.reconstruction.world.world_model import JOINTS, SCALE, WorldState
 
 
 class Posterior(NamedTuple):
     """Covariances at a unit variance of every residual.
 
-    joints : (F, 17, 3, 3) m^2 in the world; shared : (GLOBALS, GLOBALS)
+    joints : (F, 17, 3, 3) m^2 in the world; shared : of the shared unknowns
     """
 
     joints: np.ndarray
@@ -34,41 +33,43 @@ def posterior(matrix: tuple[np.ndarray, np.ndarray, np.ndarray], state: WorldSta
     except np.linalg.LinAlgError:
         return None
     frames, scale = len(state.joints), float(state.globals[SCALE])
-    lever = by_shared.reshape(frames, FRAME, GLOBALS)[:, CAMERA:].reshape(frames, JOINTS, 3, GLOBALS) / scale
+    cameras, shared_size = state.camera.shape[1], border.shape[1]
+    lever = by_shared.reshape(frames, -1, shared_size)[:, cameras:].reshape(frames, JOINTS, 3, -1) / scale
     lever[..., SCALE] += state.joints / scale**2
     joints = np.empty((frames, JOINTS, 3, 3))
     blocks = _diagonal_blocks(factor, frames)
     for joint in range(JOINTS):
-        at = slice(CAMERA + 3 * joint, CAMERA + 3 * joint + 3)
+        at = slice(cameras + 3 * joint, cameras + 3 * joint + 3)
         joints[:, joint] = blocks[:, at, at] / scale**2
-    weighted = (lever.reshape(-1, GLOBALS) @ shared).reshape(lever.shape)
+    weighted = (lever.reshape(-1, shared_size) @ shared).reshape(lever.shape)
     return Posterior(joints + weighted @ np.swapaxes(lever, -1, -2), shared)
 
 
 def _diagonal_blocks(factor: np.ndarray, frames: int) -> np.ndarray:
-    """(F, FRAME, FRAME) blocks of the inverse of a band, from its Cholesky factor, last frame first.
+    """(F, N, N) blocks of the inverse of a band, from its Cholesky factor, last frame first.
 
     Source: Takahashi, Fagan, Chin 1973, by blocks: of the inverse only what the band couples is computed.  The blocks
     are sums of squares, so single precision, which takes half the time, keeps four digits of them.
     """
     from scipy.linalg import get_lapack_funcs
 
-    columns = np.zeros((frames, 3 * FRAME, FRAME), np.float32)
-    by_frame = factor.reshape(WIDTH, frames, FRAME)
-    for i in range(FRAME):
-        columns[:, i : i + WIDTH, i] = by_frame[:, :, i].T
+    width, size = len(factor), factor.shape[1] // frames
+    columns = np.zeros((frames, 3 * size, size), np.float32)
+    by_frame = factor.reshape(width, frames, size)
+    for i in range(size):
+        columns[:, i : i + width, i] = by_frame[:, :, i].T
     invert = get_lapack_funcs("trtri", (columns,))
     # NumPy's batched inverse knows no triangles: three times as long.
-    inverse = np.stack([invert(triangle, lower=1)[0] for triangle in columns[:, :FRAME]])
-    coupling = columns[:, FRAME:] @ inverse
+    inverse = np.stack([invert(triangle, lower=1)[0] for triangle in columns[:, :size]])
+    coupling = columns[:, size:] @ inverse
     own = np.swapaxes(inverse, 1, 2) @ inverse
-    out = np.empty((frames, FRAME, FRAME))
-    later, before = np.zeros((2, 2 * FRAME, 2 * FRAME), np.float32)
+    out = np.empty((frames, size, size))
+    later, before = np.zeros((2, 2 * size, 2 * size), np.float32)
     for frame in range(frames - 1, -1, -1):
         off = -later @ coupling[frame]
         block = own[frame] - coupling[frame].T @ off
         out[frame] = 0.5 * (block + block.T)  # rounding of the skew part would grow from frame to frame
-        before[:FRAME, :FRAME], before[FRAME:, FRAME:] = out[frame], later[:FRAME, :FRAME]
-        before[FRAME:, :FRAME], before[:FRAME, FRAME:] = off[:FRAME], off[:FRAME].T
+        before[:size, :size], before[size:, size:] = out[frame], later[:size, :size]
+        before[size:, :size], before[:size, size:] = off[:size], off[:size].T
         later, before = before, later
     return out

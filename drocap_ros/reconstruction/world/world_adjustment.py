@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,12 +18,12 @@ from drocap_ros.reconstruction.common.banded import backward, band_factor, forwa
 from drocap_ros.reconstruction.common.line_search import search_line
 from drocap_ros.reconstruction.common.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.findings import Findings
+from drocap_ros.reconstruction.world.joined_views import JoinedViews, joined_state, joined_weights
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
     CALIBRATED,
     FLOOR,
-    FRAME,
     GLOBALS,
     LENGTHS,
     MISALIGNMENT,
@@ -32,7 +32,7 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldInput,
     WorldState,
 )
-from drocap_ros.reconstruction.world.world_residuals import WorldResiduals, gradient, weights_of
+from drocap_ros.reconstruction.world.world_residuals import OUTLIER_SQUARE, WorldResiduals, WorldWeights, gradient
 
 #: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 1e-4
@@ -56,6 +56,7 @@ class WorldSolution:
     """Result of the adjustment.
 
     joints : (F, 17, 3) m in the world
+    state : of all views; std : of the first one's
     contact : (F - 1, 4) of ``FEET``, right and left ankle, right and left toe
     std : (GLOBALS,) posterior standard deviations of the shared unknowns, NaN = unknown
     turned, turned_std : (3,) rad about the gimbal's axes: pitch, yaw, roll
@@ -83,7 +84,25 @@ def initial_state(data: WorldInput, start: WorldState) -> WorldState:
     shared = start.globals.copy()
     shared[LENGTHS] = data.lengths
     shared[FLOOR] = np.percentile(start.joints[:, ANKLES, 2], 10)
-    return WorldState(start.joints, start.camera, shared)
+    return joined_state(WorldState(start.joints, start.camera, shared), len(data.further))
+
+
+#: Residuals of one view, or of several of the same body.
+_Residuals: TypeAlias = WorldResiduals | JoinedViews
+
+
+def _residuals(
+    data: WorldInput,
+    weights: tuple[WorldWeights, ...],
+    state: WorldState,
+    contact: np.ndarray,
+    contact_weight: float,
+    outlier: float = OUTLIER_SQUARE,
+    floor_std: float = HEIGHT_STD_M,
+) -> _Residuals:
+    if data.further:
+        return JoinedViews(data, weights, state, contact, contact_weight, outlier, floor_std)
+    return WorldResiduals(data, weights[0], state, contact, contact_weight, outlier, floor_std)
 
 
 class _Stage(NamedTuple):
@@ -126,13 +145,13 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
     start : its lengths and floor do not matter
     held : so many frames at the begin keep their joints and their camera's errors
     """
-    config, weights = data.config, weights_of(data)
+    config, weights = data.config, joined_weights(data)
     state = initial_state(data, start)
     stop, done, ground, floor_std = ITERATIONS, 0, float("nan"), HEIGHT_STD_M
     contact: np.ndarray = np.zeros((len(start.joints) - 1, len(FEET)))
-    outlier = WorldResiduals(data, weights, state, contact, 0.0).usual_outlier()
-    seen = data.weight > 0 if data.seen is None else data.seen
-    feet = RestingFeet(seen, data.fps, data.still, start.joints)
+    outlier = _residuals(data, weights, state, contact, 0.0).usual_outlier()
+    seen = np.any([view.weight > 0 if view.seen is None else view.seen for view in (data, *data.further)], axis=0)
+    feet = RestingFeet(seen, data.fps, _still(data), start.joints)
     for stage in _stages(config, held):
         done += 1
         if config.feet:
@@ -140,7 +159,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         if stage.finds_floor:
             ground = _ground_spread(state, contact)
             floor_std = _floor_std(ground)
-        here = WorldResiduals(data, weights, state, contact, stage.weight, outlier, floor_std)
+        here = _residuals(data, weights, state, contact, stage.weight, outlier, floor_std)
         there = _improved(here, held, stage.locking)
         if there is None:
             stop = NO_DESCENT
@@ -149,31 +168,44 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         if stage.locking and here.cost - there.cost <= _CONVERGED * here.cost:
             stop = CONVERGED
             break
-    final = WorldResiduals(data, weights, state, contact, config.contact_weight, floor_std=floor_std)
+    final = _residuals(data, weights, state, contact, config.contact_weight, floor_std=floor_std)
     return _solution(final, ground, done, stop)
 
 
-def _improved(here: WorldResiduals, held: int, locking: bool) -> WorldResiduals | None:
+def _still(data: WorldInput) -> np.ndarray | None:
+    """(F, 2) probability that a foot rests, the mean of the views'."""
+    known = [view.still for view in (data, *data.further) if view.still is not None]
+    return np.mean(known, axis=0) if known else None
+
+
+def _equations(here: _Residuals) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Gradient and normal matrix."""
+    if isinstance(here, JoinedViews):
+        return here.gradient(), here.normal_matrix()
+    return gradient(here), normal_matrix(here)
+
+
+def _improved(here: _Residuals, held: int, locking: bool) -> _Residuals | None:
     """The point after one step of Gauss-Newton, shortened until the cost falls; None = there is none."""
-    frames, shared = gradient(here)
-    matrix = normal_matrix(here)
-    matrix[0][: held * FRAME, 0] += _HOLD
+    (frames, shared), matrix = _equations(here)
+    matrix[0][: held * frames.shape[1], 0] += _HOLD
     step = _solve(matrix, frames, shared, locking)
     if step is None:
         return None
     slope = float((frames * step[0]).sum() + shared @ step[1])
 
-    def moved(share: float) -> WorldResiduals | None:
+    def moved(share: float) -> _Residuals | None:
         there = here.moved(share * step[0], share * step[1])
         return there if there.state.globals[SCALE] > _LEAST_SCALE else None
 
     return search_line(here.cost, slope, moved)
 
 
-def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason: str) -> WorldSolution:
+def _solution(final: _Residuals, ground: float, iterations: int, stop_reason: str) -> WorldSolution:
     """The solution with its errors, by the posterior covariance where the normal equations have one."""
-    data, weights, state = final.data, final.weights, final.state
-    found = posterior(normal_matrix(final), state)
+    data, state = final.data, final.state
+    weights = final.weights[0] if isinstance(final, JoinedViews) else final.weights
+    found = posterior(_equations(final)[1], state)
     fact = data.config.frames_per_fact
     axes = data.telemetry.gimbal_axes()
     std, turned_std = np.full(GLOBALS, np.nan), np.full(3, np.nan)
@@ -181,12 +213,13 @@ def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason
     findings = Findings.unknown()
     if found is not None:
         prior = np.sqrt(fact * np.diag(np.linalg.inv(weights.shared)))
-        std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(found.shared)), prior)
+        shared = found.shared[:GLOBALS, :GLOBALS]
+        std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(shared)), prior)
         covariance = fact * found.joints
-        turns = _STD_FACTOR**2 * fact * axes @ found.shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
+        turns = _STD_FACTOR**2 * fact * axes @ shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
         least = fact * axes @ np.linalg.inv(weights.shared[MISALIGNMENT, MISALIGNMENT]) @ axes.T
         turned_std = np.sqrt(np.minimum(np.diag(turns), np.diag(least)))
-        findings = _findings(fact * found.shared, weights.shared / fact, weights.expected, state.globals)
+        findings = _findings(fact * shared, weights.shared / fact, weights.expected, state.globals[:GLOBALS])
     return WorldSolution(
         joints=state.joints / state.globals[SCALE],
         state=state,
@@ -246,7 +279,7 @@ def _solve(
     if factor is None:
         return None
     if fixed:
-        return backward(factor, forward(factor, -frames.reshape(-1, 1))).reshape(-1, FRAME), np.zeros(GLOBALS)
+        return backward(factor, forward(factor, -frames.reshape(-1, 1))).reshape(frames.shape), np.zeros(len(shared))
     y = forward(factor, np.concatenate([-frames.reshape(-1, 1), border], axis=1))
     step = np.linalg.solve(corner - y[:, 1:].T @ y[:, 1:], -shared - y[:, 1:].T @ y[:, 0])
-    return backward(factor, y[:, :1] - y[:, 1:] @ step[:, None]).reshape(-1, FRAME), step
+    return backward(factor, y[:, :1] - y[:, 1:] @ step[:, None]).reshape(frames.shape), step

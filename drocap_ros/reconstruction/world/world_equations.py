@@ -47,7 +47,7 @@ def normal_matrix(r: WorldResiduals) -> tuple[np.ndarray, np.ndarray, np.ndarray
     # Elements below the diagonal lie here, in the rows before theirs.
     band[:, :, FRAME:] = 0.0
     _add_time(r, band)
-    corner[:BONES, :BONES] += GAUGE_M**-2
+    corner[:BONES, :BONES] += r.weights.body * GAUGE_M**-2
     prior = r.weights.shared.copy()
     prior[SCALE] /= r.state.globals[SCALE]
     prior[:, SCALE] /= r.state.globals[SCALE]
@@ -87,7 +87,7 @@ def _add_body(r: WorldResiduals, blocks: np.ndarray, border: np.ndarray, corner:
     depth = along[:, 1:, None, None] * (r.view[:, :, None] * r.view[:, None, :])[:, None]
     own[:, 1:] += depth
     own[:, 0] += depth.sum(axis=1)
-    precision = SPAN_STD_M**-2
+    precision = r.weights.body * SPAN_STD_M**-2
     slope = precision[:, None] * r.direction
     # A bone that is too long is stiff across, too: without this term its turn and its length take turns for many steps.
     across = (precision * np.maximum(r.excess, 0.0))[..., None]

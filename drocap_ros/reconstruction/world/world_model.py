@@ -31,6 +31,8 @@ MISALIGNMENT = slice(SCALE + 1, SCALE + 4)
 ATTITUDE_LATENCY = MISALIGNMENT.stop
 POSITION_LATENCY = ATTITUDE_LATENCY + 1
 GLOBALS = POSITION_LATENCY + 1
+#: Those of every camera; each further view of the same body has its own, behind ``GLOBALS``.
+OF_VIEW = slice(MISALIGNMENT.start, GLOBALS)
 #: The unknowns of a :class:`~drocap_ros.reconstruction.world.findings.Findings`.
 CALIBRATED = slice(SCALE, GLOBALS)
 
@@ -118,6 +120,8 @@ class WorldInput:
     seen : (F, 17) bool, the keypoints that a network saw, the others are the lifter's; None = those with a weight
     known : findings of earlier windows
     still : (F, 2) the network's probability that the right and the left foot rest, None = unknown
+    further : other cameras' views of the same body at the same instants
+    placed_m, placed_deg : of such a view, standard deviations of the camera's place and attitude in this world
     """
 
     keypoints: np.ndarray
@@ -131,6 +135,9 @@ class WorldInput:
     seen: np.ndarray | None = None
     known: Findings | None = None
     still: np.ndarray | None = None
+    further: tuple[WorldInput, ...] = ()
+    placed_m: float = 0.0
+    placed_deg: float = 0.0
 
     @property
     def fps(self) -> float:
@@ -143,8 +150,9 @@ class WorldState:
     """One point in the space of the unknowns.
 
     joints : (F, 17, 3) m of the body, world axes
-    camera : (F, 6) error of the reported position (m) and rotation (rad, camera axes) that wanders
-    globals : (GLOBALS,) lengths, floor (m of the body), scale, misalignment (rad), latencies (s)
+    camera : (F, 6 V) of V views, each: error of the reported position (m) and rotation (rad, camera axes) that wanders
+    globals : (GLOBALS,) lengths, floor (m of the body), scale, misalignment (rad), latencies (s); then ``OF_VIEW`` of
+        each further view
     """
 
     joints: np.ndarray
@@ -157,5 +165,6 @@ class WorldState:
 
     def moved(self, frames: np.ndarray, shared: np.ndarray) -> WorldState:
         """The point after a step of the frames' unknowns (F, FRAME) and of the shared ones (GLOBALS,)."""
-        joints = self.joints + frames[:, CAMERA:].reshape(self.joints.shape)
-        return WorldState(joints, self.camera + frames[:, :CAMERA], self.globals + shared)
+        cameras = self.camera.shape[1]
+        joints = self.joints + frames[:, cameras:].reshape(self.joints.shape)
+        return WorldState(joints, self.camera + frames[:, :cameras], self.globals + shared)

@@ -65,6 +65,7 @@ class WorldWeights(NamedTuple):
     wander, first : (6,) of the change of the camera's errors between frames, and of the first ones
     shared : (GLOBALS, GLOBALS) inverse covariance of the priors
     expected : (GLOBALS,) their means: the logarithm of the scale, and differences from the lifter's lengths
+    body : of the bones; 0 = another view has them
     """
 
     acceleration: float
@@ -74,6 +75,7 @@ class WorldWeights(NamedTuple):
     first: np.ndarray
     shared: np.ndarray
     expected: np.ndarray
+    body: float = 1.0
 
 
 def weights_of(data: WorldInput) -> WorldWeights:
@@ -171,7 +173,7 @@ class WorldResiduals:
         span = joints[:, SPANS[:, 1]] - joints[:, SPANS[:, 0]]
         length = np.sqrt(np.square(span).sum(-1) + _LEAST_SQUARE_M2)
         self.direction = span / length[..., None]
-        self.stretch = (length - lengths) / SPAN_STD_M
+        self.stretch = self.weights.body * (length - lengths) / SPAN_STD_M
         self.excess = 1.0 - lengths / length
         self.swing = joints[2:] - 2 * joints[1:-1] + joints[:-2]
 
@@ -193,7 +195,7 @@ class WorldResiduals:
     def _compare_shared(self) -> None:
         """Lengths, scale, misalignment and latencies with their priors."""
         shared, lengths = self.state.globals, self.data.lengths
-        self.gauge = (shared[:BONES].sum() - lengths[:BONES].sum()) / GAUGE_M
+        self.gauge = self.weights.body * (shared[:BONES].sum() - lengths[:BONES].sum()) / GAUGE_M
         self.prior = shared.copy()
         self.prior[LENGTHS] -= lengths
         self.prior[SCALE] = np.log(shared[SCALE])
