@@ -84,7 +84,7 @@ def even_capture(tracks: Tracks, keypoints: Keypoints2D, poses: PlacedPoses, ori
     points = np.zeros((*weight.shape, 2))
     seen = np.zeros(weight.shape, bool)
     seen[slot] = keypoints.weights > 0
-    weight[slot] = _weights(keypoints, poses.image_sigma)
+    weight[slot] = keypoint_weights(keypoints, poses.image_sigma)
     # Joints that are not seen, as toes by many networks, stand where the lifter expects them.
     points[slot] = np.where(keypoints.seen[..., None], keypoints.xy, poses.image)
     return EvenCapture(
@@ -144,7 +144,7 @@ def capture_parts(stamp_ns: np.ndarray, slot: np.ndarray) -> list[slice]:
     return [slice(int(slot[begin]), int(slot[end - 1]) + 1) for begin, end in zip(begins, ends, strict=True)]
 
 
-def _weights(keypoints: Keypoints2D, image_sigma: np.ndarray) -> np.ndarray:
+def keypoint_weights(keypoints: Keypoints2D, image_sigma: np.ndarray) -> np.ndarray:
     """(F, 17) 1/px^2; without a covariance the noise comes from the third difference in time.
 
     Errors of 2D joints last for some frames, which halves their differences.

@@ -34,15 +34,21 @@ _OWN = OF_VIEW.stop - OF_VIEW.start
 
 
 def joined_weights(data: WorldInput) -> tuple[WorldWeights, ...]:
-    """Weights of every view; a further one has no body of its own, and its camera stands where it was placed."""
-    out = [weights_of(data)]
-    for view in data.further:
+    """Weights of every view; a further one has no body of its own, and a placed camera errs by its placement."""
+    out = []
+    for number, view in enumerate((data, *data.further)):
         weights, fact = weights_of(view), view.config.frames_per_fact
-        first, shared = weights.first.copy(), np.zeros((GLOBALS, GLOBALS))
-        first[:3] = fact / (fact / first[:3] + view.placed_m**2)
-        shared[OF_VIEW, OF_VIEW] = weights.shared[OF_VIEW, OF_VIEW]
-        shared[MISALIGNMENT, MISALIGNMENT] = fact * np.eye(3) / np.deg2rad(view.placed_deg) ** 2
-        out.append(weights._replace(first=first, shared=shared, acceleration=0.0, body=0.0))
+        if number:
+            shared = np.zeros((GLOBALS, GLOBALS))
+            shared[OF_VIEW, OF_VIEW] = weights.shared[OF_VIEW, OF_VIEW]
+            weights = weights._replace(shared=shared, acceleration=0.0, body=0.0)
+        if view.placed_m:
+            first, shared = weights.first.copy(), weights.shared.copy()
+            first[:3] = fact / (fact / first[:3] + view.placed_m**2)
+            if view.placed_deg:
+                shared[MISALIGNMENT, MISALIGNMENT] = fact * np.eye(3) / np.deg2rad(view.placed_deg) ** 2
+            weights = weights._replace(first=first, shared=shared)
+        out.append(weights)
     return tuple(out)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from drocap_ros.reconstruction.world.even_capture import (
     even_capture,
 )
 from drocap_ros.reconstruction.world.findings import MEASURED, Findings
+from drocap_ros.reconstruction.world.joined_views import view_state
 from drocap_ros.reconstruction.world.telemetry_checks import (
     frozen,
     jump_m,
@@ -68,6 +69,7 @@ class RefinedWorld:
     covariance : (F, 17, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
     found : of the last window; before : that window, for the next one
+    further : (V, F, 6) of V further views, corrections of the camera's position (m) and rotation (rad, camera axes)
     """
 
     joints: np.ndarray
@@ -78,6 +80,30 @@ class RefinedWorld:
     calibration: list[dict[str, object]]
     found: Findings
     before: Before
+    further: np.ndarray
+
+
+class Beside(NamedTuple):
+    """Other cameras' views of the same body at all slots of the even grid, in the same world.
+
+    placed_m, placed_deg : of the first view's own camera, as in :class:`WorldInput`
+    """
+
+    views: tuple[WorldInput, ...] = ()
+    placed_m: float = 0.0
+    placed_deg: float = 0.0
+
+    def window(self, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> tuple[WorldInput, ...]:
+        """The views at some slots, about an origin (3,) m."""
+        return tuple(_at_slots(view, rows, lengths, origin) for view in self.views)
+
+
+def _at_slots(view: WorldInput, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> WorldInput:
+    path = view.telemetry
+    per_slot = {name: getattr(view, name) for name in ("keypoints", "weight", "depth", "depth_sigma", "seen", "still")}
+    cut = {name: None if values is None else values[rows] for name, values in per_slot.items()}
+    telemetry = CameraTelemetry(path.rotation[rows], path.position[rows] - origin, path.fps)
+    return replace(view, telemetry=telemetry, lengths=lengths, **cut)
 
 
 class Before(NamedTuple):
@@ -108,11 +134,14 @@ def refine_in_world(
     config: WorldConfig | None = None,
     known: Findings | None = None,
     before: Before | None = None,
+    beside: Beside | None = None,
 ) -> RefinedWorld | Refusal:
     """Adjust poses and camera of :func:`refinable` tracks; a refusal where the telemetry cannot be true.
 
     ``known`` : findings of earlier windows; ``before`` : the last of them, which a live window continues.
+    ``beside`` : other cameras' views of the same body.
     """
+    beside = beside or Beside()
     config = config or WorldConfig()
     rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
     assert rotation is not None
@@ -125,15 +154,17 @@ def refine_in_world(
     if config.checks and (refusal := _impossible(capture, windows)):
         return refusal
     start, held = _start(tracks.stamp_ns, (poses.joints - origin) / poses.factor, origin, 1.0 / poses.factor, before)
-    facts, faded = _Facts(), _Faded(len(capture.body))
-    for window, telemetry, found in _adjusted(capture, windows, _Scene(matrix, config, start, held, known)):
-        faded.add(window, found, telemetry)
+    facts, faded = _Facts(), _Faded(len(capture.body), len(beside.views))
+    for window, data, found in _adjusted(capture, windows, _Scene(matrix, config, start, held, known, beside)):
+        telemetry = data.telemetry
+        faded.add(window, found, data)
         facts.add(window, found, telemetry, config.stature_std)
         last = found
     if config.checks and (refusal := facts.refusal()):
         return refusal
-    joints, camera, wander, covariance = (values[capture.slot] for values in faded.mean())
+    joints, cameras, wander, covariance = (values[capture.slot] for values in faded.mean())
     joints += origin
+    camera, *further = np.moveaxis(cameras, 1, 0)
     return RefinedWorld(
         joints=joints,
         rotation=exp_so3(camera[:, 3:]) @ rotation,
@@ -142,7 +173,8 @@ def refine_in_world(
         covariance=covariance[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]],
         calibration=facts.calibration,
         found=last.findings,
-        before=Before(tracks.stamp_ns, joints, wander, last.state.globals),
+        before=Before(tracks.stamp_ns, joints, wander, last.state.globals[:GLOBALS]),
+        further=np.array(further).reshape(-1, len(joints), CAMERA),
     )
 
 
@@ -162,18 +194,19 @@ def _impossible(capture: EvenCapture, windows: list[CaptureWindow]) -> Refusal |
 
 
 class _Scene(NamedTuple):
-    """What the windows of a recording have in common: camera (3, 3) px, start, and what is known before."""
+    """What the windows of a recording have in common: camera (3, 3) px, start, what is known before, other views."""
 
     matrix: np.ndarray
     config: WorldConfig
     start: Before
     held: int
     known: Findings | None
+    beside: Beside
 
 
 def _adjusted(
     capture: EvenCapture, windows: list[CaptureWindow], scene: _Scene
-) -> Iterator[tuple[CaptureWindow, CameraTelemetry, WorldSolution]]:
+) -> Iterator[tuple[CaptureWindow, WorldInput, WorldSolution]]:
     """Every window adjusted; the findings of one part are known in the next."""
     joints, wander = (at_all_slots(values, capture.slot) for values in (scene.start.joints, scene.start.wander))
     lengths = np.median(span_lengths(capture.body), axis=0)
@@ -195,23 +228,28 @@ def _adjusted(
             seen=capture.seen[rows],
             known=prior,
             still=None if capture.still is None else capture.still[rows],
+            further=scene.beside.window(rows, lengths, capture.origin),
+            placed_m=scene.beside.placed_m,
+            placed_deg=scene.beside.placed_deg,
         )
         state = WorldState(joints[rows], wander[rows], scene.start.shared)
         found = adjust_in_world(data, state, scene.held if rows.start == 0 else 0)
         gathered = (gathered or Findings.unknown()).later(found.findings, 1.0, 0.0)
-        yield window, telemetry, found
+        yield window, data, found
 
 
 class _Faded:
     """Solutions of windows, faded into each other: joints, corrections of the camera, its wander, covariances."""
 
-    def __init__(self, slots: int) -> None:
-        shapes = (JOINTS, 3), (CAMERA,), (CAMERA,), (JOINTS, 3, 3)
+    def __init__(self, slots: int, further: int = 0) -> None:
+        shapes = (JOINTS, 3), (1 + further, CAMERA), (CAMERA,), (JOINTS, 3, 3)
         self._sums = [np.zeros((slots, *shape)) for shape in shapes]
         self._weight = np.zeros(slots)
 
-    def add(self, window: CaptureWindow, found: WorldSolution, telemetry: CameraTelemetry) -> None:
-        values = found.joints, _correction(found, telemetry), found.state.camera, found.covariance
+    def add(self, window: CaptureWindow, found: WorldSolution, data: WorldInput) -> None:
+        views = enumerate((data, *data.further))
+        cameras = np.stack([_correction(view_state(found.state, n), view.telemetry) for n, view in views], axis=1)
+        values = found.joints, cameras, found.state.camera[:, :CAMERA], found.covariance
         for total, value in zip(self._sums, values, strict=True):
             total[window.rows] += _per_frame(window.fade, value) * value
         self._weight[window.rows] += window.fade
@@ -279,9 +317,9 @@ def _start(
     return Before(stamp_ns, joints, wander, shared), _HELD
 
 
-def _correction(found: WorldSolution, telemetry: CameraTelemetry) -> np.ndarray:
+def _correction(state: WorldState, telemetry: CameraTelemetry) -> np.ndarray:
     """(F, 6) corrections of the reported position (m) and rotation (rad, camera axes)."""
-    shared, state = found.state.globals, found.state
+    shared = state.globals
     path = state.path(telemetry)
     position = path.position - telemetry.position + state.camera[:, :3]
     turned = shared[MISALIGNMENT] + state.camera[:, 3:] + path.turn_rate * shared[ATTITUDE_LATENCY]

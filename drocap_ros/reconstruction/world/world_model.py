@@ -121,7 +121,8 @@ class WorldInput:
     known : findings of earlier windows
     still : (F, 2) the network's probability that the right and the left foot rest, None = unknown
     further : other cameras' views of the same body at the same instants
-    placed_m, placed_deg : of such a view, standard deviations of the camera's place and attitude in this world
+    placed_m, placed_deg : standard deviations of the place and attitude of a camera that was placed in this world by
+        the body; 0 = the world is the camera's own
     """
 
     keypoints: np.ndarray

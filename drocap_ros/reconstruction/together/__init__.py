@@ -1,0 +1,1 @@
+"""One person in several recordings: their times and places against each other, and one body adjusted to all views."""

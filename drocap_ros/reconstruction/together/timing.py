@@ -1,0 +1,104 @@
+"""Time of one recording in another: by the motion of the one person that both show."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.geometry.interpolation import usual_step
+from drocap_ros.skeleton import BODY_17, indices
+
+#: Rate (Hz) at which motions are compared.
+RATE_HZ = 100.0
+#: Standard deviation (s) of the average that is taken out: what stays is motion, without posture and errors that last.
+_SLOW_S = 1.0
+#: Standard deviation (s) of the average that takes noise out.
+_FAST_S = 0.03
+#: Shortest time (s) in which two recordings show the person together.
+LEAST_S = 2.0
+#: Joints whose heights above the pelvis and whose distances from each other are compared.
+_MOVING = ("head", "rwrist", "lwrist", "relbow", "lelbow", "rknee", "lknee", "rankle", "lankle")
+#: Weight of a distance against that of a height: depths of a single view err.
+_DISTANCE_WEIGHT = 0.3
+#: Time (s) between two different answers: motions repeat themselves after a step at the earliest.
+_APART_S = 0.3
+
+
+class TimeOffset(NamedTuple):
+    """``time of the first = time of the second + seconds``.
+
+    likeness : correlation of both motions there, at most 1
+    next_best : that of the best time that is another one
+    """
+
+    seconds: float
+    likeness: float
+    next_best: float
+
+
+def time_offsets(first: np.ndarray, second: np.ndarray, times: tuple[np.ndarray, np.ndarray]) -> list[TimeOffset]:
+    """Offsets under which two motions are most alike, best first, at most four.
+
+    Parameters
+    ----------
+    first, second : (F, 17, 3), (G, 17, 3) m, z up
+    times : (F,), (G,) s, each on its own clock
+    """
+    a, b = (_signals(joints, time) for joints, time in zip((first, second), times, strict=True))
+    score = _correlations(a, b)
+    if score is None:
+        return []
+    lag = np.arange(len(score)) - (len(b) - 1)
+    left = score.copy()
+    found = []
+    while len(found) < 4 and left.max() > 0.0:
+        best = int(left.argmax())
+        seconds = (lag[best] + _peak(score, best)) / RATE_HZ + times[0][0] - times[1][0]
+        left[max(best - round(_APART_S * RATE_HZ), 0) : best + round(_APART_S * RATE_HZ) + 1] = 0.0
+        found.append(TimeOffset(float(seconds), float(score[best]), float(left.max())))
+    return found
+
+
+def _signals(joints: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """(N, K) heights and distances of joints at ``RATE_HZ``, without what is slow: the same in every level view."""
+    from scipy.ndimage import gaussian_filter1d
+
+    at = indices(BODY_17.joints, _MOVING)
+    one, other = np.triu_indices(len(at), 1)
+    distance = np.linalg.norm(joints[:, at[one]] - joints[:, at[other]], axis=-1)
+    values = np.concatenate([joints[:, at, 2] - joints[:, :1, 2], _DISTANCE_WEIGHT * distance], axis=1)
+    even = np.arange(time[0], time[-1], 1.0 / RATE_HZ)
+    values = np.stack([np.interp(even, time, column) for column in values.T], axis=1)
+    smooth = max(_FAST_S, usual_step(time)) * RATE_HZ
+    values = gaussian_filter1d(values, smooth, axis=0, mode="nearest")
+    return np.asarray(values - gaussian_filter1d(values, _SLOW_S * RATE_HZ, axis=0, mode="nearest"))
+
+
+def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
+    """(N + M - 1,) correlation of the signals for every lag of b in a; 0 where they overlap too little."""
+    from scipy.signal import fftconvolve
+
+    least = min(LEAST_S * RATE_HZ, len(a), len(b))
+    if least < 0.5 * LEAST_S * RATE_HZ:
+        return None
+    back = b[::-1]
+    together = fftconvolve(a, back, axes=0).sum(axis=1)
+    ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
+    energy_a = fftconvolve(np.square(a).sum(axis=1), ones_b)
+    energy_b = fftconvolve(ones_a, np.square(back).sum(axis=1))
+    overlap = fftconvolve(ones_a, ones_b)
+    usual = 0.1 * max(np.square(a).sum() / len(a), np.square(b).sum() / len(b)) * overlap
+    score = together / np.sqrt(np.maximum(energy_a, usual) * np.maximum(energy_b, usual) + 1e-12)
+    # A long time together says more than a short one that is as alike.
+    score *= np.minimum(1.0, overlap / min(len(a), len(b))) ** 0.25
+    return np.where(overlap >= least - 0.5, score, 0.0)
+
+
+def _peak(score: np.ndarray, best: int) -> float:
+    """Place of the parabola's top through three scores, in samples from the middle one."""
+    if not 0 < best < len(score) - 1:
+        return 0.0
+    before, here, after = score[best - 1 : best + 2]
+    bend = before - 2.0 * here + after
+    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0

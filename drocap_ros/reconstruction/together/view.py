@@ -1,0 +1,159 @@
+"""One recording of several of the same person: its own result, and what it shows at other instants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.geometry.interpolation import usual_step
+from drocap_ros.geometry.rotations import project_to_so3
+from drocap_ros.motion import LEVEL_CAMERA
+from drocap_ros.reconstruction.reconstruct import SolvedView
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+from drocap_ros.reconstruction.world.even_capture import keypoint_weights
+from drocap_ros.reconstruction.world.in_world import in_camera_axes
+from drocap_ros.reconstruction.world.placement import place_in_world
+from drocap_ros.reconstruction.world.world_model import PlacedPoses, WorldConfig, WorldInput
+
+_PELVIS = 0
+#: Longest time (s) between two images between which a joint is interpolated.
+_GAP_S = 0.1
+#: Way (m) within which a camera stands.
+_STANDS_M = 0.05
+#: Errors of a camera on a tripod: of its attitude none but that of its placement.
+_STANDING = WorldConfig(latency_std_s=1e-3, position_wander_m=0.002, attitude_wander_deg=0.01, checks=False)
+
+
+class Doubt(NamedTuple):
+    """Standard deviations of a camera's placement in the common world, and of its path's slow errors beyond its own.
+
+    placed_deg : 0 = a camera that knows up errs as it does alone
+    """
+
+    placed_m: float
+    placed_deg: float
+    wander_m: float
+
+
+@dataclass(frozen=True)
+class View:
+    """A recording in its own world, z up.
+
+    solved : of the recording alone
+    joints : (F, 17, 3) m; turn : (F, 3, 3) world -> camera; path : (F, 3) m
+    own_world : whether the recording has a world, by telemetry or by its picture; else its camera is taken to stand
+    reported : whether the world is that of telemetry: east, north and up
+    config : errors of the camera there
+    """
+
+    solved: SolvedView
+    joints: np.ndarray
+    turn: np.ndarray
+    path: np.ndarray
+    own_world: bool
+    reported: bool
+    config: WorldConfig
+
+    @staticmethod
+    def of(solved: SolvedView) -> View:
+        """The view of a recording that was solved alone."""
+        motion, joints = solved.motion, solved.motion.joints3d[:, :17]
+        if motion.frame == "world" and motion.camera_position is not None:
+            rotation, position = motion.camera_rotation, motion.camera_position
+            config, given = solved.config, solved.tracks
+            reported = "camera" not in motion.meta
+            if config is not None and reported and given.camera_rotation is not None:
+                # The camera before the adjustment: its errors are to be found with all views.
+                assert given.camera_position is not None
+                rotation, position = given.camera_rotation, given.camera_position
+            config = replace(config or _STANDING, checks=False)
+            return View(solved, joints, rotation, position, True, reported, config)
+        turn = np.broadcast_to(LEVEL_CAMERA, motion.camera_rotation.shape).copy()
+        path = np.zeros((len(joints), 3))
+        standing = replace(solved.tracks, camera_rotation=turn, camera_position=path)
+        placed = place_in_world(in_camera_axes(solved.poses, solved.per_px), _image(solved), solved.per_px, standing)
+        return View(solved, placed.joints, turn, path, False, False, _STANDING)
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """(F,) s since the first image."""
+        stamps = self.solved.tracks.stamp_ns
+        return np.asarray((stamps - stamps[0]) * 1e-9)
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(3, 3) px of the lens."""
+        assert self.solved.tracks.camera_matrix is not None
+        return self.solved.tracks.camera_matrix
+
+    @property
+    def stands(self) -> bool:
+        """Whether the camera stands."""
+        return bool(np.ptp(self.path, axis=0).max() < _STANDS_M)
+
+    def moved(self, scale: float, rotation: np.ndarray, translation: np.ndarray) -> View:
+        """The view in another world: ``place there = scale * rotation @ place + translation``."""
+        return replace(
+            self,
+            joints=scale * self.joints @ rotation.T + translation,
+            path=scale * self.path @ rotation.T + translation,
+            turn=self.turn @ rotation.T,
+        )
+
+    def placed_poses(self, joints: np.ndarray) -> PlacedPoses:
+        """Input of the adjustment with other joints (F, 17, 3) m in the world."""
+        sigma, depth = self._depth()
+        image = self.solved.poses.sigma_px
+        assert image is not None
+        return PlacedPoses(joints, 1.0, depth, sigma, _image(self.solved), image[..., 0], self.solved.poses.still)
+
+    def at(self, time_s: np.ndarray, doubt: Doubt) -> WorldInput:
+        """What the view shows at times (S,) s of its own clock; no weight where it shows nothing."""
+        solved, own = self.solved, self.time_s
+        after = np.clip(np.searchsorted(own, time_s), 1, len(own) - 1)
+        before = after - 1
+        gap = own[after] - own[before]
+        part = np.clip((time_s - own[before]) / gap, 0.0, 1.0)
+        inside = (time_s >= own[0]) & (time_s <= own[-1]) & (gap < max(_GAP_S, 1.5 * usual_step(own)))
+
+        def between(values: np.ndarray) -> np.ndarray:
+            share = part.reshape(-1, *(1,) * (values.ndim - 1))
+            return np.asarray(values[before] + share * (values[after] - values[before]))
+
+        assert solved.poses.sigma_px is not None
+        weight = keypoint_weights(solved.keypoints, solved.poses.sigma_px[..., 0])
+        seen = solved.keypoints.weights > 0
+        points = np.where(seen[..., None], solved.keypoints.xy, _image(solved))
+        both = seen[before] == seen[after]  # a guess and a keypoint have no mean
+        sigma, depth = self._depth()
+        still = solved.poses.still
+        fps = 1.0 / usual_step(time_s)
+        return WorldInput(
+            keypoints=between(points),
+            weight=np.where(inside[:, None] & both, np.minimum(weight[before], weight[after]), 0.0),
+            depth=between(depth),
+            # Where the view shows nothing its depths weigh nothing.
+            depth_sigma=np.where(inside[:, None], between(sigma), 1e6),
+            lengths=np.zeros(0),
+            telemetry=CameraTelemetry(project_to_so3(between(self.turn)), between(self.path), fps),
+            camera_matrix=self.matrix,
+            config=replace(self.config, position_wander_m=max(self.config.position_wander_m, doubt.wander_m)),
+            seen=inside[:, None] & seen[before] & seen[after],
+            still=None if still is None else np.where(inside[:, None], between(still), 0.5),
+            placed_m=doubt.placed_m,
+            placed_deg=doubt.placed_deg,
+        )
+
+    def _depth(self) -> tuple[np.ndarray, np.ndarray]:
+        """(F, 17) m expected error of depths behind the pelvis, and these."""
+        poses, size = self.solved.poses, self.solved.per_px[:, None]
+        assert poses.sigma_px is not None
+        relief = poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]
+        return poses.sigma_px[..., 1] * size, relief * size
+
+
+def _image(solved: SolvedView) -> np.ndarray:
+    """(F, 17, 2) px of the poses."""
+    return np.asarray(solved.poses.joints_px[..., :2] + solved.poses.translation_px[:, None])
