@@ -14,6 +14,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.reconstruct import SolvedView
 from drocap_ros.reconstruction.together.placement import Placement, place_view
@@ -218,7 +219,9 @@ class _Problem:
         """One adjustment."""
         first = self.views[0]
         tracks = replace(first.solved.tracks, camera_rotation=first.turn, camera_position=first.path)
-        beside = Beside(tuple(inputs[1:]), inputs[0].placed_m, inputs[0].placed_deg)
+        # Bones between joints that err are too long: those of the bodies that single views give.
+        lengths = np.mean([np.median(span_lengths(view.joints), axis=0) for view in self.views], axis=0)
+        beside = Beside(tuple(inputs[1:]), inputs[0].placed_m, inputs[0].placed_deg, lengths)
         found = refine_in_world(
             tracks, first.solved.keypoints, first.placed_poses(start), inputs[0].config, beside=beside
         )

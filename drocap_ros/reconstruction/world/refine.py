@@ -87,11 +87,13 @@ class Beside(NamedTuple):
     """Other cameras' views of the same body at all slots of the even grid, in the same world.
 
     placed_m, placed_deg : of the first view's own camera, as in :class:`WorldInput`
+    lengths : (18,) m of the body, of the spans; None = those of the poses to start from
     """
 
     views: tuple[WorldInput, ...] = ()
     placed_m: float = 0.0
     placed_deg: float = 0.0
+    lengths: np.ndarray | None = None
 
     def window(self, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> tuple[WorldInput, ...]:
         """The views at some slots, about an origin (3,) m."""
@@ -209,7 +211,7 @@ def _adjusted(
 ) -> Iterator[tuple[CaptureWindow, WorldInput, WorldSolution]]:
     """Every window adjusted; the findings of one part are known in the next."""
     joints, wander = (at_all_slots(values, capture.slot) for values in (scene.start.joints, scene.start.wander))
-    lengths = np.median(span_lengths(capture.body), axis=0)
+    lengths = np.median(span_lengths(capture.body), axis=0) if scene.beside.lengths is None else scene.beside.lengths
     prior = gathered = scene.known
     for window in windows:
         rows = window.rows
