@@ -29,11 +29,11 @@ from drocap_ros.reconstruction.heels import with_heels
 from drocap_ros.reconstruction.in_metres import Body, Settings, Source, by_place, in_metres
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
-from drocap_ros.reconstruction.person_view import lens_word, person_view, with_lens
+from drocap_ros.reconstruction.person_view import lens_word, person_view, true_shape, with_lens
 from drocap_ros.reconstruction.shared_camera import SharedCamera, held, lower_ankle
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.refine import refinable
-from drocap_ros.reconstruction.world.world_model import world_config
+from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
 from drocap_ros.revision import git_revision
 from drocap_ros.skeleton import BODY_17, BODY_19
 from drocap_ros.tracks import Tracks
@@ -51,6 +51,23 @@ class _Solved(NamedTuple):
     tracks: Tracks
     source: Source
     lens: str
+
+
+class SolvedView(NamedTuple):
+    """A recording's motion, and what an adjustment with other recordings goes on from.
+
+    tracks : with the lens in use, and the camera that the motion has before its adjustment, where there is one
+    keypoints : of the method's joints
+    poses : in px; per_px : (F,) metres per px at the assumed stature
+    config : of the adjustment in the world, with the errors of that camera; None = it was not adjusted
+    """
+
+    motion: Motion
+    tracks: Tracks
+    keypoints: Keypoints2D
+    poses: ImagePoses
+    per_px: np.ndarray
+    config: WorldConfig | None
 
 
 def reconstruct(
@@ -99,6 +116,34 @@ def reconstruct_with_camera(
 
     camera : that of these images, as another person's reconstruction found it; None = it is to be found
     """
+    motion, found, settings = _reconstructed(tracks, method, initializer, adjuster, progress, camera)
+    return motion, camera or _shared(motion, found, settings)
+
+
+def solve_view(
+    tracks: Tracks,
+    *,
+    initializer: InitializerConfig | None = None,
+    adjuster: BundleAdjusterConfig | None = None,
+    progress: Progress | None = None,
+) -> SolvedView:
+    """As :func:`reconstruct` by the default method, for an adjustment with other recordings of the person."""
+    motion, found, settings = _reconstructed(tracks, "ba", initializer, adjuster, progress)
+    keypoints = body_keypoints(found.tracks, settings.body)
+    shape = true_shape(found.poses.in_image, found.tracks.camera_matrix)
+    per_px = metres_per_px(shape, found.tracks.stamp_ns, settings.initializer.assumed_height_m)
+    config = world_config(settings.adjuster) if found.source is None else found.source.config
+    return SolvedView(motion, found.tracks, keypoints, found.poses, per_px, config)
+
+
+def _reconstructed(
+    tracks: Tracks,
+    method: str,
+    initializer: InitializerConfig | None,
+    adjuster: BundleAdjusterConfig | None,
+    progress: Progress | None,
+    camera: SharedCamera | None = None,
+) -> tuple[Motion, _Solved, Settings]:
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}; choose one of them")
     adjuster = adjuster or BundleAdjusterConfig()
@@ -144,7 +189,7 @@ def reconstruct_with_camera(
     motion.meta.update(
         _meta(poses, settings), seconds={**seconds, "other": total - sum(seconds.values()), "total": total}
     )
-    return motion, camera or _shared(motion, found, settings)
+    return motion, found, settings
 
 
 def _shared(motion: Motion, found: _Solved, settings: Settings) -> SharedCamera | None:
