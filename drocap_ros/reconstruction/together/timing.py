@@ -51,7 +51,7 @@ def time_offsets(first: np.ndarray, second: np.ndarray, times: tuple[np.ndarray,
         return []
     lag = np.arange(len(score)) - (len(b) - 1)
     left = score.copy()
-    found = []
+    found: list[TimeOffset] = []
     while len(found) < 4 and left.max() > 0.0:
         best = int(left.argmax())
         seconds = (lag[best] + _peak(score, best)) / RATE_HZ + times[0][0] - times[1][0]

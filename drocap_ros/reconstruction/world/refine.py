@@ -102,10 +102,17 @@ class Beside(NamedTuple):
 
 def _at_slots(view: WorldInput, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> WorldInput:
     path = view.telemetry
-    per_slot = {name: getattr(view, name) for name in ("keypoints", "weight", "depth", "depth_sigma", "seen", "still")}
-    cut = {name: None if values is None else values[rows] for name, values in per_slot.items()}
-    telemetry = CameraTelemetry(path.rotation[rows], path.position[rows] - origin, path.fps)
-    return replace(view, telemetry=telemetry, lengths=lengths, **cut)
+    return replace(
+        view,
+        keypoints=view.keypoints[rows],
+        weight=view.weight[rows],
+        depth=view.depth[rows],
+        depth_sigma=view.depth_sigma[rows],
+        seen=None if view.seen is None else view.seen[rows],
+        still=None if view.still is None else view.still[rows],
+        telemetry=CameraTelemetry(path.rotation[rows], path.position[rows] - origin, path.fps),
+        lengths=lengths,
+    )
 
 
 class Before(NamedTuple):

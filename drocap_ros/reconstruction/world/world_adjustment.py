@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 
@@ -198,7 +198,7 @@ def _improved(here: _Residuals, held: int, locking: bool) -> _Residuals | None:
         there = here.moved(share * step[0], share * step[1])
         return there if there.state.globals[SCALE] > _LEAST_SCALE else None
 
-    return search_line(here.cost, slope, moved)
+    return cast("_Residuals | None", search_line(here.cost, slope, moved))
 
 
 def _solution(final: _Residuals, ground: float, iterations: int, stop_reason: str) -> WorldSolution:
