@@ -22,7 +22,8 @@ from drocap_ros.perception.persons import FoundPerson, find_persons, following, 
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.reconstruction.reconstruct import SolvedView, reconstruct, solve_view
+from drocap_ros.reconstruction.together.joined import join_views
 from drocap_ros.recording.evidence import with_evidence
 from drocap_ros.recording.image_messages import choose_images
 from drocap_ros.recording.open_session import is_recording, open_session
@@ -102,12 +103,7 @@ def reconstruct_input(
             raise InputError("--method live: expected the recorded telemetry, got other; leave the options out")
         return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
-    found = read_video_telemetry(Path(path), telemetry)
-    tracks, origin = read_input(Path(path), config, models, progress, telemetry, selection)
-    if found is not None:
-        ingest = config.image_ingest
-        tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, found, ingest, progress)
-    tracks = with_attitude(tracks, telemetry.attitude_deg)
+    tracks, origin = _with_own_camera(Path(path), config, models, progress, telemetry, selection)
     if selection.evidence is not None:
         tracks = with_evidence(tracks, selection.evidence)
     if selection.rate_hz:
@@ -116,11 +112,66 @@ def reconstruct_input(
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
+    return _with_origin(motion, Path(path), tracks, origin, seconds), tracks
+
+
+def _with_own_camera(
+    path: Path,
+    config: DrocapConfig,
+    models: Path | None,
+    progress: Progress | None,
+    telemetry: Telemetry = _FOUND,
+    selection: Selection = _WHOLE,
+) -> tuple[Tracks, Values]:
+    """2D tracks with the camera's pose as telemetry or options give it, and their origin for ``meta``."""
+    found = read_video_telemetry(path, telemetry)
+    tracks, origin = read_input(path, config, models, progress, telemetry, selection)
+    if found is not None:
+        tracks, origin["telemetry"] = with_telemetry(path, tracks, telemetry, found, config.image_ingest, progress)
+    return with_attitude(tracks, telemetry.attitude_deg), origin
+
+
+def _with_origin(motion: Motion, path: Path, tracks: Tracks, origin: Values, seconds: float) -> Motion:
+    """A motion whose ``meta`` says what it was made from; ``seconds`` : of reading the input."""
     images = {"images": {"size": list(tracks.image_size)}}
-    meta = {**motion.meta, "input": Path(path).name, **images, **origin}
+    meta = {**motion.meta, "input": path.name, **images, **origin}
     stages = {"pose2d": seconds, **meta.get("seconds", {})}
     meta["seconds"] = {**stages, "total": seconds + stages.get("total", 0.0)}
-    return dataclasses.replace(motion, meta=meta), tracks
+    return dataclasses.replace(motion, meta=meta)
+
+
+def reconstruct_together(
+    paths: list[Path],
+    *,
+    config: DrocapConfig,
+    models: Path | None = None,
+    progress: Progress | None = None,
+    telemetry: Telemetry = _FOUND,
+    threads: int = 0,
+) -> list[tuple[Motion, Tracks]]:
+    """The one motion that several recordings of a person show, as each recording's camera sees it, and their tracks.
+
+    Parameters
+    ----------
+    paths : inputs of :func:`reconstruct_input`, two at least; the times of the first one's images are those of all
+    telemetry : none, or that which the recordings have with them
+
+    Raises
+    ------
+    InputError
+        When an input cannot be used, or two do not show the same motion.
+    """
+    solved: list[SolvedView] = []
+    read: list[tuple[Path, Tracks, Values, float]] = []
+    for path in paths:
+        begin = time.perf_counter()
+        own, origin = _with_own_camera(path, config, models, progress, telemetry, Selection(threads=threads))
+        read.append((path, own, origin, time.perf_counter() - begin))
+        solved.append(
+            solve_view(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress)
+        )
+    motions = join_views(solved, [path.name for path in paths], config.bundle_adjuster.threads)
+    return [(_with_origin(motion, *of), of[1]) for motion, of in zip(motions, read, strict=True)]
 
 
 def _reconstruct_live(path: Path, config: DrocapConfig, progress: Progress | None) -> tuple[Motion, Tracks]:

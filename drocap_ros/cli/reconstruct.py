@@ -25,6 +25,8 @@ from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from drocap_ros.clip import Clip, Progress
     from drocap_ros.motion import Motion
     from drocap_ros.recording.video_telemetry import Telemetry
@@ -51,7 +53,16 @@ def add_parser(subparsers: Subparsers) -> None:
         help="video file, image folder, .mcap, rosbag1 .bag, rosbag2 folder, tracks .npz, or 2D keypoints of another"
         " tool (.json or a folder of them, .csv, .npz, .npy)",
     )
+    parser.add_argument(
+        "further", metavar="INPUT", nargs="*", type=Path, help="with --together: other recordings of the same motion"
+    )
     parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: INPUT's name + _motion)")
+    parser.add_argument(
+        "--together",
+        action="store_true",
+        help="one motion from several recordings of one person at the same time, by drones, phones or tripods; their"
+        " times and places against each other are found",
+    )
     add_options(parser)
     add_threads_option(parser)
     add_quiet_option(parser)
@@ -121,6 +132,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
+    if args.together or args.further:
+        from drocap_ros.cli.together import run_together
+
+        return run_together(args)
     begin = time.perf_counter()
     from drocap_ros.cli.atomic_output import default_folder
     from drocap_ros.cli.models import ensure_networks
@@ -133,7 +148,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.recording.keypoints.files import as_tracks_file
 
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
-    names = _outputs(args, out, clip)
+    names = output_names(args, out, clip)
     person, rule = parse_subject(args.subject)
     rule |= {"feet_model": args.feet} if args.feet else {}
     config = load_config(args.config).replace("pose_estimator", **rule)
@@ -169,7 +184,7 @@ def run(args: argparse.Namespace) -> int:
         )
         meta = {**motion.meta, "input": args.input.name, "command": args.command_line}
         motion = dataclasses.replace(motion, meta=meta)
-        _write(out, names, None if source != args.input else source, motion, tracks, progress)
+        write_outputs(out, names, None if source != args.input else source, motion, tracks, progress)
     if not args.quiet:
         print(f"{summary(motion, args.method, time.perf_counter() - begin)}\nwritten: {out}/{', '.join(names)}")
         if "report.html" in names:
@@ -177,7 +192,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _outputs(args: argparse.Namespace, out: Path, clip: Clip) -> list[str]:
+def output_names(args: argparse.Namespace, out: Path, clip: Clip) -> list[str]:
     """Names of the files to write; refuses a folder that cannot be written, and a file that is the input."""
     from drocap_ros.cli.atomic_output import check_output_folder, is_same, refuse_inputs
 
@@ -189,9 +204,16 @@ def _outputs(args: argparse.Namespace, out: Path, clip: Clip) -> list[str]:
     return names
 
 
-def _write(
-    out: Path, names: list[str], source: Path | None, motion: Motion, tracks: Tracks, progress: Progress
+def write_outputs(
+    out: Path,
+    names: list[str],
+    source: Path | None,
+    motion: Motion,
+    tracks: Tracks,
+    progress: Progress,
+    beside: Sequence[Motion] = (),
 ) -> None:
+    """Write the output folder at once; ``beside`` : the motion as further cameras see it."""
     from drocap_ros.cli.atomic_output import output_folder
     from drocap_ros.motion import save_motion
     from drocap_ros.report.motion_images import has_images
@@ -200,6 +222,8 @@ def _write(
 
     with output_folder(out) as folder:
         save_motion(folder / "motion.npz", motion)
+        for number, further in enumerate(beside, start=2):
+            save_motion(folder / f"camera_{number}.npz", further)
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)
         if "report.html" in names:

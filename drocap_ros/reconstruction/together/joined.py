@@ -10,6 +10,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.reconstruct import SolvedView
 from drocap_ros.reconstruction.together.placement import Placement, place_view
@@ -25,8 +26,8 @@ _LEAST_LIKENESS = 0.3
 _SAME_ORIGIN_M, _SAME_NORTH_DEG = 4.0, 10.0
 
 
-def join_views(solved: list[SolvedView], names: list[str]) -> list[Motion]:
-    """One body from several recordings of one person, each solved alone.
+def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> list[Motion]:
+    """One body from several recordings of one person, each solved alone, by so many threads.
 
     Returns
     -------
@@ -49,7 +50,8 @@ def join_views(solved: list[SolvedView], names: list[str]) -> list[Motion]:
     home = _home(views)
     moved = _in_world_of(home, views, placed)
     problem = JoinedProblem(moved, home, [offset.seconds for offset in offsets])
-    return _results(problem, problem.solve(), names)
+    with blas_threads(threads):
+        return _results(problem, problem.solve(), names)
 
 
 def _best_fit(first: View, view: View, name: str, to: str) -> tuple[TimeOffset, Placement]:
