@@ -9,6 +9,8 @@ near         cameras from 3.3 m on, exact 2D; lens, rotation and position known 
 world        placement and scale from telemetry, on simulated captures: page accuracy_world
 telemetry    the motion in the world by telemetry that errs (`drocap evaluate world`), every third sequence: page
              accuracy_telemetry
+together     two cameras 120 degrees apart whose times and places nobody knows (`drocap reconstruct A B --together`),
+             every third sequence: page accuracy_together
 calibration  gimbal yaw and latency found from telemetry that errs, an orbit that reverses once, `--runs` flights: page
              accuracy_calibration
 
@@ -50,6 +52,7 @@ from lab.studies.live_study import live_study
 from lab.studies.live_study_table import live_markdown
 from lab.studies.live_world import live_world_markdown, live_world_study
 from lab.studies.near_camera import DISTANCES_M, NearCamera, error_mm, known, without_camera
+from lab.studies.together import together_markdown, together_study
 
 SPEED_DEG_S = 25.0
 SOLUTION_DELAY_S = 0.5
@@ -189,9 +192,26 @@ def calibration(args: argparse.Namespace) -> None:
     write_figures("accuracy_calibration", "Yaw and latency of the telemetry, found", "\n".join(pages))
 
 
+def together(args: argparse.Namespace) -> None:
+    """Two drones by exact and rough telemetry, two that hold still without any, with and without fixed points."""
+    pages = []
+    cases = [
+        WorldCase("exact"),
+        WorldCase("gps"),
+        WorldCase("gps", background=True),
+        WorldCase("none", still=True),
+        WorldCase("none", still=True, background=True),
+    ]
+    for case in cases:
+        with progress_bars() as progress:
+            rows = together_study(world_sequences(args.mocap, 3, args.limit), case, progress)
+        pages.append(together_markdown(rows, case))
+    write_figures("accuracy_together", "One body in the views of two cameras", "\n".join(pages))
+
+
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective, "near": near,
-    "world": world, "telemetry": telemetry, "calibration": calibration,
+    "world": world, "telemetry": telemetry, "together": together, "calibration": calibration,
 }  # fmt: skip
 
 

@@ -115,6 +115,6 @@ def _check(args: argparse.Namespace, inputs: list[Path]) -> None:
         given.append("telemetry")
     if given:
         raise InputError(
-            f"--together: expected recordings as they are, got --{given[0].replace('_', '-')}; reconstruct that one alone"
-            " with it, then name its tracks.npz here"
+            f"--together: expected whole recordings, got --{given[0].replace('_', '-')}; reconstruct that one alone so,"
+            " then name its tracks.npz here"
         )

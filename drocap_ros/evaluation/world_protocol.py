@@ -35,6 +35,8 @@ SPEED_DEG_S = 19.0  # deg/s: two metres a second at the radius
 #: Height at which the camera aims, m, and the smoothing of the aim's path.
 _AIM_M = 0.95
 _AIM_SMOOTHING_S = 1.0  # s, standard deviation
+#: Angle between two cameras about the person, deg.
+APART_DEG = 120.0
 #: Half the time that the orbit takes to turn round.
 _TURN_S = 0.5
 #: Height of a standing ankle, m.
@@ -48,6 +50,8 @@ _OUTLIER_PX = 80.0  # px
 #: Correlation times of the errors of position and attitude.
 _POSITION_WANDER_S = 60.0
 _ATTITUDE_WANDER_S = 10.0  # s
+#: Between the seeds of two cameras: more than there are sequences.
+_CAMERA_SEEDS = 1_000_000
 
 
 class TelemetryErrors(NamedTuple):
@@ -80,6 +84,7 @@ class WorldCase:
     still : the camera keeps its bearing from the person instead of orbiting
     reverse_s : the orbit turns back every so many seconds, first after half of them, within a second; 0 = never
     background : the tracks hold fixed points of the scene
+    camera : its number; each flies ``APART_DEG`` ahead of the one before and errs on its own
 
     Raises
     ------
@@ -91,6 +96,7 @@ class WorldCase:
     still: bool = False
     reverse_s: float = 0.0
     background: bool = False
+    camera: int = 0
 
     def __post_init__(self) -> None:
         if not (self.reverse_s == 0.0 or 2 * _TURN_S <= self.reverse_s < np.inf):
@@ -154,7 +160,11 @@ def world_view(
     rng = np.random.default_rng(seed)
     truth = _on_ground(sequence.x / 1000.0)
     frames = len(truth)
-    orbit = _Orbit(rng.uniform(0, 2 * np.pi), 0.0 if case.still else np.deg2rad(SPEED_DEG_S), case.reverse_s)
+    phase = rng.uniform(0, 2 * np.pi) + case.camera * np.deg2rad(APART_DEG)
+    if case.camera:
+        seed += _CAMERA_SEEDS * case.camera
+        rng = np.random.default_rng(seed)
+    orbit = _Orbit(phase, 0.0 if case.still else np.deg2rad(SPEED_DEG_S), case.reverse_s)
     position, rotation = _camera(truth, orbit, 0.0)
     # The toes have draws of their own: those of the other joints are the same with and without them.
     body, toes = np.split(_project(truth, position, rotation), [len(BODY_15)], axis=1)
