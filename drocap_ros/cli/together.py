@@ -37,8 +37,8 @@ def run_together(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     from drocap_ros.cli.atomic_output import default_folder
     from drocap_ros.cli.models import ensure_networks
+    from drocap_ros.cli.motion_output import output_names, summary, write_outputs
     from drocap_ros.cli.progress import progress_bars
-    from drocap_ros.cli.reconstruct import output_names, summary, write_outputs
     from drocap_ros.cli.report import open_words
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder

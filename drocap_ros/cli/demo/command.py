@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.demo.flight import check_flown, fly_in_real_time, fly_in_simulated_time
     from drocap_ros.cli.demo.operator import Operator
     from drocap_ros.cli.demo.verdict import judge_flight
-    from drocap_ros.cli.reconstruct import summary
+    from drocap_ros.cli.motion_output import summary
     from drocap_ros.cli.report import open_words
     from drocap_ros.errors import InputError
     from drocap_ros.evaluation.compare import compare

@@ -6,11 +6,14 @@ the errors of every camera and the joints once; the shared ones are those of the
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.contacts import FEET, HEIGHT_STD_M
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.world_equations import WIDTH, normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
     CAMERA,
@@ -50,6 +53,38 @@ def joined_weights(data: WorldInput) -> tuple[WorldWeights, ...]:
             weights = weights._replace(first=first, shared=shared)
         out.append(weights)
     return tuple(out)
+
+
+class Beside(NamedTuple):
+    """Other cameras' views of the same body at all slots of the even grid, in the same world.
+
+    placed_m, placed_deg : of the first view's own camera, as in :class:`WorldInput`
+    lengths : (18,) m of the body, of the spans; None = those of the poses to start from
+    """
+
+    views: tuple[WorldInput, ...] = ()
+    placed_m: float = 0.0
+    placed_deg: float = 0.0
+    lengths: np.ndarray | None = None
+
+    def window(self, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> tuple[WorldInput, ...]:
+        """The views at some slots, about an origin (3,) m."""
+        return tuple(_at_slots(view, rows, lengths, origin) for view in self.views)
+
+
+def _at_slots(view: WorldInput, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> WorldInput:
+    path = view.telemetry
+    return replace(
+        view,
+        keypoints=view.keypoints[rows],
+        weight=view.weight[rows],
+        depth=view.depth[rows],
+        depth_sigma=view.depth_sigma[rows],
+        seen=None if view.seen is None else view.seen[rows],
+        still=None if view.still is None else view.still[rows],
+        telemetry=CameraTelemetry(path.rotation[rows], path.position[rows] - origin, path.fps),
+        lengths=lengths,
+    )
 
 
 class JoinedViews:

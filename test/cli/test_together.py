@@ -1,0 +1,108 @@
+"""``drocap reconstruct A B --together``: two recordings of one person whose times and places nobody knows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drocap_ros.cli import main
+from drocap_ros.evaluation.metrics import pa_mpjpe
+from drocap_ros.motion import load_motion
+from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
+from drocap_ros.simulation.simulated_person import simulate_person
+from drocap_ros.skeleton import BODY_17
+from drocap_ros.tracks import Tracks, save_tracks
+
+SIZE, FPS, FRAMES = (1280, 720), 30.0, 240
+#: s by which the second recording starts later; its clock is another one.
+LATER_S = 0.81
+_CLOCK_NS = 1_700_000_000_000_000_000
+
+
+def truth(time_s: np.ndarray, action: str = "mixed") -> np.ndarray:
+    return simulate_person(time_s, action, 1, 1.75, BODY_17)
+
+
+def seen_from(bearing_deg: float, time_s: np.ndarray, action: str = "mixed") -> Tracks:
+    """The person before a camera that stands: nothing but the lens is known of it."""
+    joints = truth(time_s, action)
+    middle = np.broadcast_to(joints[:, 0].mean(axis=0), (len(joints), 3))
+    rotation, position = orbit_camera(np.zeros(len(joints)), middle, 7.0, 1.6, 0.0, bearing_deg)
+    matrix = pinhole_matrix(*SIZE, 60.0)
+    pixels = project(joints, rotation, position, matrix)
+    pixels += np.random.default_rng(int(bearing_deg)).normal(0.0, 2.0, pixels.shape)
+    stamps = np.round(np.arange(len(joints)) * 1e9 / FPS).astype(np.int64)
+    return Tracks(pixels, BODY_17.joints, stamps, SIZE, camera_matrix=matrix)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    time_s = np.arange(FRAMES) / FPS
+    save_tracks(folder / "left.npz", seen_from(0.0, time_s))
+    right = seen_from(100.0, time_s[:-40] + LATER_S)
+    save_tracks(folder / "right.npz", replace(right, stamp_ns=right.stamp_ns + _CLOCK_NS))
+    save_tracks(folder / "other.npz", seen_from(100.0, time_s, "squats"))
+    return folder
+
+
+def test_two_still_cameras_give_one_body_that_is_better_than_either(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    inputs = [str(recordings / name) for name in ("left.npz", "right.npz")]
+    assert main(["reconstruct", *inputs, "--together", "--out", str(tmp_path / "both"), "--no-report"]) == 0
+    said = capsys.readouterr().out
+    assert "right.npz: its first image 0.8" in said
+    assert "after that of left.npz" in said
+    assert main(["reconstruct", inputs[0], "--out", str(tmp_path / "one"), "--no-report", "--quiet"]) == 0
+    both, one = (load_motion(tmp_path / name) for name in ("both", "one"))
+    joints = truth(np.arange(FRAMES) / FPS)
+    error, alone = (pa_mpjpe(motion.joints3d[:, :15], joints[:, :15]).mean() for motion in (both, one))
+    assert error < 0.8 * alone
+    view = both.meta["together"]["views"][1]
+    assert view["offset_s"] == pytest.approx(LATER_S, abs=0.01)
+    assert view["median_px"] < 5.0
+    # The second camera's file has the same motion on its own clock, and a camera that sees its own keypoints.
+    right = load_motion(tmp_path / "both" / "camera_2.npz")
+    assert right.stamp_ns[0] == pytest.approx(_CLOCK_NS, abs=1e9 / FPS)
+    assert right.camera_position is not None
+    there = np.flatnonzero(both.stamp_ns * 1e-9 >= view["offset_s"])[: len(right.stamp_ns)]
+    np.testing.assert_array_equal(right.joints3d, both.joints3d[there])
+    assert float(np.nanmedian(right.reprojection_px)) < 5.0
+
+
+def test_a_recording_of_another_motion_is_refused_by_its_name(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    inputs = [str(recordings / name) for name in ("left.npz", "other.npz")]
+    assert main(["reconstruct", *inputs, "--together", "--out", str(tmp_path / "no")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert error.count("\n") == 0
+    assert "other.npz: expected the motion that left.npz shows" in error
+    assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["left.npz", "right.npz"], "add --together"),
+        (["left.npz", "--together"], "two INPUTs"),
+        (["left.npz", "left.npz", "--together"], "same one twice"),
+        (["left.npz", "right.npz", "--together", "--start", "1"], "--start"),
+        (["left.npz", "right.npz", "--together", "--method", "paper"], "--method"),
+        (["left.npz", "missing.npz", "--together"], "no such file"),
+    ],
+)
+def test_what_does_not_fit_together_is_one_line(
+    recordings: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, options: list[str], word: str
+) -> None:
+    monkeypatch.chdir(recordings)
+    before = sorted(recordings.iterdir())
+    assert main(["reconstruct", *options]) == 2
+    error = capsys.readouterr().err.strip()
+    assert word in error
+    assert "\n" not in error
+    assert sorted(recordings.iterdir()) == before
