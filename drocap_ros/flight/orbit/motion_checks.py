@@ -224,7 +224,8 @@ def outdated_condition(seen: Observed, oldest_s: float) -> Condition:
     """What is wrong with the pictures where the subject's position is older than ``oldest_s``.
 
     Where the newest picture itself is too old, the greater part of its age says why: it came late, or none came since.
-    A newer one repeats the one before, shows something else in the subject's place, or does not show him.
+    A newer one waits for the vehicle's attitude at its exposure, repeats the one before, shows something else in the
+    subject's place, or does not show him.
     """
     pictures, age_s = seen.pictures, seen.subject.age_s
     if pictures.age_s > oldest_s:
@@ -232,6 +233,8 @@ def outdated_condition(seen: Observed, oldest_s: float) -> Condition:
         if pictures.silent_s > late_s or math.isinf(pictures.silent_s):
             return condition(_C.PICTURES_LOST, age_s=age_s, silent_s=pictures.silent_s)
         return condition(_C.PICTURES_LATE, age_s=age_s, late_s=late_s)
+    if seen.vehicle.age_s > pictures.age_s:
+        return condition(_C.ATTITUDE_OUTDATED, age_s=seen.vehicle.age_s)
     if pictures.frozen:
         return condition(_C.PICTURES_FROZEN, age_s=age_s)
     return condition(_C.OTHER_SUBJECT if seen.subject.contradicted else _C.SUBJECT_OUTDATED, age_s=age_s)

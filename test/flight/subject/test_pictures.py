@@ -76,6 +76,12 @@ def test_the_greater_part_of_the_age_says_whether_pictures_come_late_or_not_at_a
     assert allowed_pace(old, LIMITS).cause.code == code
 
 
+@pytest.mark.parametrize(("attitude_s", "code"), [(0.05, _C.SUBJECT_OUTDATED), (0.19, _C.ATTITUDE_OUTDATED)])
+def test_a_picture_that_waits_for_the_attitude_is_not_blamed(attitude_s, code):
+    waiting = changed(GOOD, subject_age_s=0.3, picture_age_s=0.12, silent_s=0.02, state_age_s=attitude_s)
+    assert allowed_pace(waiting, LIMITS).cause.code == code
+
+
 def test_a_subject_who_is_in_doubt_slows_the_orbit_down_at_once_and_is_named():
     doubted = changed(GOOD, subject_contradicted=True)
     assert allowed_pace(doubted, LIMITS).cause.code == _C.OTHER_SUBJECT
