@@ -210,6 +210,30 @@ def test_keypoints_are_drawn_on_their_own_image(browser, pages):
     assert pixels_of(browser, "image") == with_overlay
 
 
+@pytest.mark.parametrize("width", [1600, 390])
+def test_the_body_is_drawn_at_its_keypoints_of_the_image(browser, pages, person, width):
+    browser.open(pages / "images.html", width, 900)
+    browser.run(
+        """window.arcs = []; const arc = CanvasRenderingContext2D.prototype.arc;
+        CanvasRenderingContext2D.prototype.arc = function (x, y, ...more) {
+          if (this.canvas.id === "image") arcs.push([x, y]);
+          return arc.call(this, x, y, ...more); }; 0"""
+    )
+    for frame in (0, 31, 58):
+        browser.run(f"arcs.length = 0; show({frame})")
+        browser.settle()
+        shown, arcs, box, size = browser.run(
+            """[images.places[images.nearest(state.frame)], arcs, imageBox,
+            [byId("image").clientWidth, byId("image").clientHeight]]"""
+        )
+        assert abs(shown - frame) <= 1  # every third frame has an image
+        low, high = np.reshape(box, (2, 2))
+        scale = np.min(np.array(size) / (high - low))
+        found = person.keypoints[shown][np.isfinite(person.keypoints[shown]).all(axis=1)]
+        at = (np.array(arcs[-len(found) :]) - 0.5 * np.array(size)) / scale + 0.5 * (low + high)
+        np.testing.assert_allclose(at, found, atol=0.1)  # px of the image
+
+
 def test_charts_of_movement_follow_the_player_and_are_chosen(browser, pages):
     browser.open(pages / "plain.html", 1400, 1000)
     shown = '[...document.querySelectorAll("#charts figure:not([hidden]) b")].map((b) => b.textContent)'
