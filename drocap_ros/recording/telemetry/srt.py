@@ -1,8 +1,9 @@
 """States of the camera from the subtitles that a DJI drone writes beside its video.
 
 Supported forms: bracketed ``[latitude: 47.3] [rel_alt: 10.0 abs_alt: 450.1] [gb_yaw: 12.3 gb_pitch: -20.0
-gb_roll: 0.0]``; ``F_PRY (..°, ..°, ..°), G.PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older
-``GPS(lon,lat,n) BAROMETER:20.5``, of some models ``GPS(lat,lon,0.0M)`` or ``GPS(E:lon, N:lat, 5.0m)``.
+gb_roll: 0.0]``, the gimbal also as ``gimbal_yaw``, the aircraft as ``drone_yaw`` or ``flight_yaw``; ``F_PRY (..°, ..°,
+..°), G.PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older ``GPS(lon,lat,n) BAROMETER:20.5``, of some models
+``GPS(lat,lon,0.0M)`` or ``GPS(E:lon, N:lat, 5.0m)``.
 """
 
 from __future__ import annotations
@@ -30,15 +31,16 @@ _LINE = 8192
 _HEIGHTS = ("rel_alt", "barometer", "abs_alt", "altitude")
 _NUMBER = r"([-+]?\d{1,10}(?:\.\d{1,12})?)"
 _TIME = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})\s*-->")
-_VALUE = re.compile(
-    rf"\b(latitude|longitude|longtitude|rel_alt|abs_alt|altitude|gb_yaw|gb_pitch|gb_roll)\s*:\s*{_NUMBER}",
-    re.IGNORECASE,
-)
+_VALUE = re.compile(rf"\b(latitude|longitude|longtitude|rel_alt|abs_alt|altitude)\s*:\s*{_NUMBER}", re.IGNORECASE)
+#: Angles by name: of the gimbal, or of the aircraft.
+_ANGLE = re.compile(rf"\b(gb|gimbal|drone|flight|aircraft)[_. ]?(pitch|roll|yaw)(?:degree)?\s*:\s*{_NUMBER}", re.I)
 _CLOCK = re.compile(r"\d\s+(\d{1,2}):(\d\d):(\d\d[.,]\d{3})")
 _GPS = re.compile(rf"\bGPS\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I)
 _BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
-_PRY = re.compile(rf"\b([FG])[._ ]?PRY\s*\(\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*\)")
+#: Pitch, roll and yaw; the degree sign may be in any encoding.
+_THREE = r"[^-+,()0-9]{0,8},\s*".join([_NUMBER] * 3)
+_PRY = re.compile(rf"\b([FG])[._ ]?PRY\s*:?\s*\(\s*{_THREE}[^,()0-9]{{0,8}}\)", re.IGNORECASE)
 
 
 class _Entry(NamedTuple):
@@ -135,8 +137,12 @@ def _entry(stamp_ns: int, text: str) -> _Entry | None:
     """One subtitle; None without telemetry."""
     values = _values(text)
     angles = {kind.upper(): (float(p), float(r), float(y)) for kind, p, r, y in _PRY.findall(text)}
-    if "gb_yaw" in values and "gb_pitch" in values:
-        angles["G"] = (values["gb_pitch"], values.get("gb_roll", 0.0), values["gb_yaw"])
+    named: dict[str, dict[str, float]] = {"G": {}, "F": {}}
+    for of, angle, number in _ANGLE.findall(text):
+        named["G" if of.lower() in ("gb", "gimbal") else "F"][angle.lower()] = float(number)
+    for of, found in named.items():
+        if "yaw" in found and "pitch" in found:
+            angles[of] = (found["pitch"], found.get("roll", 0.0), found["yaw"])
     kind = next((name for name in _HEIGHTS if name in values), "")
     if not kind and not angles:
         return None

@@ -165,13 +165,27 @@ def test_dji_subtitles_of_older_models_are_read(tmp_path):
         "GPS (8.00{i:02d}00, 47.000000, 17), D 8.00m, H 5.00m",
     ],
 )
-@pytest.mark.parametrize("angles", ["F_PRY ({0}), G_PRY ({1})", "F.PRY ({0}), G.PRY ({1})", "F PRY({0}) G PRY({1})"])
-def test_every_spelling_of_subtitles_is_one_flight(tmp_path, place, angles):
+@pytest.mark.parametrize(
+    "angles",
+    [
+        "F_PRY ({0}), G_PRY ({1})",
+        "F.PRY ({0}), G.PRY ({1})",
+        "F PRY({0}) G PRY({1})",
+        "f_pry: ({0}), g_pry: ({1})",
+        "[gb_yaw : {i}.5 gb_pitch : -20.0 gb_roll : 0.0] [drone_yaw: {i}.0 drone_pitch: -3.0 drone_roll: 0.5]",
+        "GimbalPitchDegree: -20.0 GimbalYawDegree: +{i}.5 FlightYawDegree: {i}.0 FlightPitchDegree: -3.0"
+        " FlightRollDegree: 0.5",
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
+def test_every_spelling_of_subtitles_is_one_flight(tmp_path, place, angles, encoding):
     pry = "-3.0°, 0.5°, {i}.0°", "-20.0°, 0.0°, {i}.5°"
     lines = [
-        (place + "\n" + angles.format(*pry)).replace("{i:02d}", f"{i:02d}").replace("{i}", str(i)) for i in range(20)
-    ]
-    (tmp_path / "x.SRT").write_text(srt_text(np.arange(20.0), lines))
+        f"{place}\n{angles}".replace("{0}", pry[0]).replace("{1}", pry[1]).replace("{i:02d}", f"{i:02d}")
+        .replace("{i}", str(i))
+        for i in range(20)
+    ]  # fmt: skip
+    (tmp_path / "x.SRT").write_text(srt_text(np.arange(20.0), lines), encoding=encoding)
     track = read_telemetry(tmp_path / "x.SRT").track
     metres = 19e-4 * 111_320 * math.cos(math.radians(47))
     assert np.ptp(track.position, axis=0) == pytest.approx([metres, 0, 0], abs=0.01 * metres)
