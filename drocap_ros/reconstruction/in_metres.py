@@ -16,7 +16,7 @@ from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.common.spread import packed
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
-from drocap_ros.reconstruction.person_view import true_shape
+from drocap_ros.reconstruction.person_view import aside, true_shape
 from drocap_ros.reconstruction.shared_camera import SharedCamera
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import WorldPoses, metres_per_px
@@ -85,7 +85,8 @@ def in_metres(
     shape = true_shape(poses.in_image, tracks.camera_matrix, about_pelvis=about_pelvis)
     per_px = metres_per_px(shape, tracks.stamp_ns, height_m)
     if isinstance(source, SharedCamera):
-        factor, std = source.stature(seen_from_camera(tracks, poses, per_px))
+        seen = aside(poses, tracks.camera_matrix) if about_pelvis and tracks.camera_matrix is not None else poses
+        factor, std = source.stature(seen_from_camera(tracks, seen, per_px))
         height_m, per_px, source = factor * height_m, factor * per_px, source.for_stature(std)
     meta: dict[str, object] = {
         "lens": settings.lens,

@@ -149,11 +149,18 @@ def _with_joints(poses: ImagePoses, in_image: np.ndarray, scale: np.ndarray) -> 
     return replace(poses, joints_px=in_image, translation_px=np.zeros((len(in_image), 2)), sigma_px=sigma)
 
 
+def aside(poses: ImagePoses, matrix: np.ndarray) -> ImagePoses:
+    """Poses of a person that a method took as in the middle of the picture, with depths along the camera's axis."""
+    shape = true_shape(poses.in_image, matrix, about_pelvis=True)
+    return _with_joints(poses, np.concatenate([poses.in_image[..., :2], shape[..., 2:]], axis=-1), np.ones(len(shape)))
+
+
 def true_shape(in_image: np.ndarray, matrix: np.ndarray | None, *, about_pelvis: bool = False) -> np.ndarray:
     """(F, P, 3) px about the pelvis, in camera axes, without what the perspective of a known lens does to a pose.
 
     in_image : (F, P, 3) px, x and y in the image, depth in the scale of the pelvis
-    about_pelvis : whether the axis is taken to go through the pelvis
+    about_pelvis : whether a method took the person as in the middle of the picture: the shape is that of a camera that
+        looks at the pelvis, and is turned as its ray is
     """
     if matrix is None:
         return np.asarray(in_image - in_image[:, :1])
@@ -163,4 +170,4 @@ def true_shape(in_image: np.ndarray, matrix: np.ndarray | None, *, about_pelvis:
     centre = in_image[:, :1, :2] if about_pelvis else matrix[:2, 2]
     place = np.concatenate([(in_image[..., :2] - centre) / focal * depth[..., None], depth[..., None]], axis=-1)
     about: np.ndarray = place - place[:, :1]
-    return about
+    return about @ towards((in_image[:, 0, :2] - matrix[:2, 2]) / focal) if about_pelvis else about

@@ -29,7 +29,7 @@ from drocap_ros.reconstruction.heels import with_heels
 from drocap_ros.reconstruction.in_metres import Body, Settings, Source, by_place, in_metres
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
-from drocap_ros.reconstruction.person_view import lens_word, person_view, true_shape, with_lens
+from drocap_ros.reconstruction.person_view import aside, lens_word, person_view, true_shape, with_lens
 from drocap_ros.reconstruction.shared_camera import SharedCamera, held, lower_ankle
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.refine import refinable
@@ -248,7 +248,8 @@ def _with_picture(
     tracks = dataclasses.replace(tracks, camera_matrix=camera.matrix)
     poses = _solve(tracks, keypoints, settings)
     per_px = metres_per_px(poses.joints_px, tracks.stamp_ns, settings.initializer.assumed_height_m)
-    tracks, world = with_camera(tracks, camera, poses, per_px, world_config(settings.adjuster))
+    seen = aside(poses, camera.matrix) if by_place(tracks, settings) else poses
+    tracks, world = with_camera(tracks, camera, seen, per_px, world_config(settings.adjuster))
     return tracks, world, settings, poses if world.config is None else None
 
 
