@@ -54,6 +54,15 @@ autoapi_keep_files = False
 autodoc_typehints = "signature"
 
 html_theme = "furo"
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
+#: The colours of the report.
+html_theme_options = {
+    f"{theme}_css_variables": dict.fromkeys(
+        ("color-brand-primary", "color-brand-content", "color-brand-visited"), colour
+    )
+    for theme, colour in (("light", "#0a7d78"), ("dark", "#3fbdb5"))
+}
 html_title = f"drocap_ros {release}"
 
 #: Places of the pages in the site's menu; those of `figures/` stand below their own index.

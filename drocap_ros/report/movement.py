@@ -102,9 +102,11 @@ def _speeds(motion: Motion, s: Statistics, frames: np.ndarray) -> Iterator[Curve
     joints = upright_joints(motion)
     pelvis = joints[:, [motion.joints.index("pelvis")]]
     path_known = motion.frame == "world" and bool(np.ptp(pelvis[np.isfinite(pelvis).all(axis=(1, 2))], axis=0).any())
-    words = "Through the world, mean over 0.2 s."
+    half = _half_window(s.times_s)
+    mean = f"mean over {2 * half * float(np.median(np.diff(s.times_s))):.1g} s"
+    words = f"Through the world, {mean}."
     if not path_known:
-        words = "Against the pelvis, whose path is not known, in axes that turn with the body; mean over 0.2 s."
+        words = f"Against the pelvis, whose path is not known, in axes that turn with the body; {mean}."
         joints = _facing(joints - pelvis, s.heading_rad)
     if path_known:
         yield Curve("Pelvis speed", "m/s", words, ("middle",), _speed(pelvis, s.times_s, frames))
@@ -122,10 +124,14 @@ def _facing(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
     return np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
 
 
+def _half_window(times_s: np.ndarray) -> int:
+    """Frames before and after each that a speed counts, at least one."""
+    return min(max(1, round(_HALF_S / float(np.median(np.diff(times_s))))), (len(times_s) - 1) // 2)
+
+
 def _speed(joints: np.ndarray, times_s: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """(N, P) m/s at frames (N,): length of the slope of the line through the places (F, P, 3) around each."""
-    half = max(1, round(_HALF_S / float(np.median(np.diff(times_s)))))
-    half = min(half, (len(times_s) - 1) // 2)
+    half = _half_window(times_s)
     window = np.clip(frames - half, 0, len(times_s) - 1 - 2 * half)[:, None] + np.arange(2 * half + 1)
     since = times_s[window] - times_s[window].mean(axis=1, keepdims=True)
     slope = np.einsum("nw,nwpi->npi", since, joints[window]) / np.square(since).sum(axis=1)[:, None, None]

@@ -25,6 +25,7 @@ def test_a_moving_person_has_its_speeds_in_every_joint(person):
     for name in ("Pelvis speed", "Wrist speed", "Ankle speed"):
         np.testing.assert_allclose(found[name].values, 1.0, atol=1e-9)
         assert found[name].unit == "m/s"
+        assert found[name].words == "Through the world, mean over 0.1 s."  # the frames beside each, at 15 Hz
     some = curves(dataclasses.replace(person, joints3d=moving), np.array([0, 59]))
     assert some["Wrist speed"].values.shape == (2, 2)
 
