@@ -92,7 +92,7 @@ def _track_fact(file: BinaryIO, track: Track) -> tuple[str, str]:
         span = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9 if len(stamp_ns) else 0.0
         words += f", {len(stamp_ns)} samples" + (f", {(len(stamp_ns) - 1) / span:.2f}/s" if span > 0 else "")
     except InputError as error:
-        words += f", damaged: {error}"
+        words += f": {error}"
     return f"{_KINDS.get(track.handler) or _printable(track.handler)} track", words
 
 

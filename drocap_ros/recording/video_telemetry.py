@@ -106,7 +106,7 @@ def read_own(video: Path) -> tuple[tuple[Path, TelemetryLog] | None, list[str]]:
         try:
             return (source, read_djmd(video) if source == video else read_telemetry(source)), problems
         except (InputError, OSError) as error:  # noqa: PERF203  # two files at most
-            problems.append(str(error))
+            problems.append(f"{source}: {str(error).removeprefix(f'{source}: ')}")
     return None, problems
 
 

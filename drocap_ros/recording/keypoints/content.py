@@ -110,7 +110,12 @@ def _named_points(node: Node, content: Content) -> np.ndarray | None:
 
 
 def _lists(node: Node, keys: tuple[str, ...]) -> Iterator[list[object]]:
-    yield from (value for key in keys if isinstance(value := node.get(key), list))
+    for value in (node.get(key) for key in keys):
+        if isinstance(value, list):
+            yield value
+        elif isinstance(value, dict):  # Ultralytics writes columns
+            columns = [column for name in ("x", "y", "visible") if isinstance(column := value.get(name), list)]
+            yield list(map(list, zip(*columns, strict=False)))
 
 
 def _first_of(values: Mapping[str, Value], keys: tuple[str, ...]) -> Value | None:

@@ -199,7 +199,11 @@ def _sizes(file: IO[bytes], box: Box | None, length: int) -> np.ndarray:
     if box is None or len(head) < 8:
         raise InputError("expected sample sizes (stsz), found none")
     common, count = struct.unpack(">II", head)
-    if count == 0 or count > MAX_FRAMES or common * count > length:
+    if count == 0:  # they stand between the parts of the video, as browsers and streaming programs write
+        raise InputError(
+            "expected samples in the index, found none (a fragmented MP4); rewrite it: ffmpeg -i IN -c copy OUT"
+        )
+    if count > MAX_FRAMES or common * count > length:
         raise InputError(f"expected 1 to {MAX_FRAMES} samples inside the file, found {count} of {common} bytes")
     if common:
         return np.full(count, common, np.int64)

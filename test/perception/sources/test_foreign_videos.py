@@ -144,6 +144,14 @@ def test_undecoded_video_names_its_codec(shared):
         assert "convert it: ffmpeg" in str(error)  # noqa: PT017
 
 
+def test_info_names_a_video_in_fragments(tmp_path, capsys):
+    """Its index holds no samples; they stand between its parts."""
+    path = write_video(tmp_path / "a.mp4")
+    patch_box(path, b"stsz", lambda content: content[:8] + bytes(len(content) - 8))
+    assert main(["info", str(path)]) == 0
+    assert "found none (a fragmented MP4); rewrite it: ffmpeg -i IN -c copy OUT" in capsys.readouterr().out
+
+
 def test_an_elementary_stream_is_no_index_of_an_mp4(tmp_path):
     """Its first bytes are a box of a size in 64 bits, beyond any file."""
     (tmp_path / "a.h264").write_bytes(b"\0\0\0\x01\x67\x64\0\x1e" + b"\xff" * 400)

@@ -82,6 +82,14 @@ def named_points(folder, k, far):
     ])  # fmt: skip
 
 
+def columns(folder, k, far):
+    return write(folder / "ultralytics.json", [
+        [{"name": "person", "box": {"x1": 0, "y1": 0}, "keypoints": dict(zip(("x", "y", "visible"), p.T.tolist(),
+          strict=True))}]
+        for p in k
+    ])  # fmt: skip
+
+
 def deeplabcut(folder, k, far):
     names = ["_".join(reversed(n.split("_", 1))).title() if "_" in n else n for n in COCO_17.joints]  # Shoulder_Left
     head = [["scorer"] + ["net"] * 51, ["bodyparts"] + [n for n in names for _ in range(3)],
@@ -123,7 +131,7 @@ def text(path, content):
     return path
 
 
-FORMS = [alphapose, cmu_form, openpose, mmpose, coco, named_points, deeplabcut, several_animals,
+FORMS = [alphapose, cmu_form, openpose, mmpose, coco, named_points, columns, deeplabcut, several_animals,
          with_scores, rate_only, bare_array]  # fmt: skip
 
 
