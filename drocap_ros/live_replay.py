@@ -60,8 +60,8 @@ def reconstruct_live(
     """Motion by the live method, from the session's messages ``pose2d`` and what the adjuster hears beside them.
 
     The motion is that of the subject in most images.  A frame's pose is that of the last window that holds it, one in
-    ``map`` first, else its initial one.  Where at least half of the frames are in ``map``, the motion has these, in
-    frame "world"; else all, in frame "camera".  The windows are those that the live graph adjusted where the session
+    ``map`` or ``odom`` first, else its initial one.  Where at least half of the frames are there, the motion has these,
+    in frame "world"; else all, in frame "camera".  The windows are those that the live graph adjusted where the session
     holds them, else all that are due.  Memory: the poses and one window.
 
     Raises
@@ -120,11 +120,15 @@ def reconstruct_live(
 
 
 class _Frame(NamedTuple):
-    """A frame's pose (17, 3) m: in ``map`` with the camera's rotation and position there, or in camera axes."""
+    """A frame's pose (17, 3) m: in ``map`` with the camera's rotation and position there, or in camera axes.
+
+    path : 0 = in ``map``, else the number of the path in ``odom``
+    """
 
     observation: PoseObservation
     joints: np.ndarray
     camera: tuple[np.ndarray, np.ndarray] | None = None
+    path: int = 0
 
     def in_camera_axes(self) -> _Frame:
         """The pose with its pelvis at the origin."""
@@ -136,20 +140,24 @@ class _Frame(NamedTuple):
 
 def _take_window(frames: dict[int, _Frame], result: LiveWindow) -> None:
     """Take the window's poses; a pose in ``map`` stays, as a window after the end of the telemetry holds it too."""
-    window = result.window
+    window, path = result.window, 0 if result.window.in_map is None else result.window.in_map.path
     for i, stamp_ns in enumerate(window.stamp_ns.tolist()):
         if window.in_map is not None or frames[stamp_ns].camera is None:
-            frames[stamp_ns] = _Frame(frames[stamp_ns].observation, result.joints3d[i], _camera_of(window, i))
+            frames[stamp_ns] = _Frame(frames[stamp_ns].observation, result.joints3d[i], _camera_of(window, i), path)
 
 
 def _motion_of(
     session: Session, frames: dict[int, _Frame], matrix: np.ndarray | None, config: DrocapConfig
 ) -> tuple[Motion, Tracks]:
-    """The motion in ``map`` of the frames that are there, where at least half are; else of all in camera axes."""
-    in_map = {stamp: frame for stamp, frame in frames.items() if frame.camera is not None}
-    if in_map and 2 * len(in_map) >= len(frames):
-        tracks, joints3d = _arrays(session, in_map, matrix)
-        return _motion_in_world(tracks, joints3d, config), tracks
+    """The motion in ``map``, or of one path in ``odom``, where at least half of the frames are there; else of all in
+    camera axes.
+    """
+    paths = [frame.path for frame in frames.values() if frame.camera is not None]
+    path = max(sorted(set(paths)), key=paths.count, default=0)
+    there = {stamp: frame for stamp, frame in frames.items() if frame.camera is not None and frame.path == path}
+    if there and 2 * len(there) >= len(frames):
+        tracks, joints3d = _arrays(session, there, matrix)
+        return _motion_in_world(tracks, joints3d, config, metric=path == 0), tracks
     tracks, joints3d = _arrays(session, {stamp: frame.in_camera_axes() for stamp, frame in frames.items()})
     return _motion(tracks, joints3d, config), tracks
 
@@ -197,19 +205,22 @@ def _format(observation: PoseObservation) -> str:
     return f"{observation.joints.name} in images of {width}x{height} px"
 
 
-def _motion_in_world(tracks: Tracks, joints3d: np.ndarray, config: DrocapConfig) -> Motion:
+def _motion_in_world(tracks: Tracks, joints3d: np.ndarray, config: DrocapConfig, *, metric: bool) -> Motion:
     assert tracks.camera_rotation is not None
     assert tracks.camera_position is not None
-    motion = _motion(tracks, joints3d, config)
+    seen = (joints3d - joints3d[:, :1]) @ np.swapaxes(tracks.camera_rotation, 1, 2)
+    motion = _motion(tracks, seen, config)
     camera = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
+    off = motion.reprojection_px if camera[2] is None else reprojection_px(joints3d, *camera, motion.keypoints)
     return dataclasses.replace(
         motion,
+        joints3d=joints3d,
         frame="world",
-        metric=True,
-        scale_source="telemetry",
+        metric=metric,
+        scale_source="telemetry" if metric else "assumed_height",
         camera_rotation=tracks.camera_rotation,
         camera_position=tracks.camera_position,
-        reprojection_px=reprojection_px(joints3d, *camera, motion.keypoints),
+        reprojection_px=off,
     )
 
 

@@ -3,7 +3,8 @@
 Subscribes ``pose2d``, ``pose3d/initial``, ``background``, ``vehicle/state`` and ``camera_info``; publishes
 ``pose3d/refined`` (drocap_ros/Pose3DWindow), and for every image ``pose3d/latest`` (drocap_ros/Pose3D): its initial
 pose with the bone lengths of the last window, stage INITIAL until there is one.  With the camera's pose and a measured
-scale both are in ``map``, else in the camera's optical frame; ``/diagnostics`` says why.
+scale both are in ``map``, else in the camera's optical frame; ``/diagnostics`` says why.  Without any telemetry windows
+are in ``odom`` where fixed points give the camera's path, which is then on ``/tf``.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, Effort
 from drocap_ros.recording.pose_messages import add_calibration, add_state, fixed_points_from_message, float_array
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import (
+    camera_transform,
     latest_pose_to_ros,
     pose2d_from_ros,
     pose3d_from_ros,
@@ -39,6 +41,7 @@ from drocap_ros.ros.conversions import (
     window_to_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
+from drocap_ros.ros.topics import TFMessage
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Joint sets of initial poses.
@@ -97,6 +100,7 @@ class BundleAdjusterNode(ComponentNode):
         self._uncalibrated = ""  # why the images have no calibration
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
+        self._tf = self.output("/tf") if TFMessage is not None else None
         self.input("pose2d", self._on_pose2d)
         self.input("pose3d/initial", self._on_initial)
         self.input("background", self._on_background)
@@ -236,6 +240,8 @@ class BundleAdjusterNode(ComponentNode):
         self._refined.publish(
             window_to_ros(window, solved.header, solved.track_id, self._sequence, seconds, solved.known_ns)
         )
+        if window.in_map is not None and window.in_map.path and self._tf is not None:
+            self._tf.publish(TFMessage(transforms=[camera_transform(window, solved.header.frame_id)]))
         self._sequence += 1
         self.count(Key.ADJUSTMENTS)
         self.produced(int(window.stamp_ns[-1]))
@@ -250,8 +256,10 @@ class BundleAdjusterNode(ComponentNode):
             use = TelemetryUse.LATE
         self.details[Key.TELEMETRY] = use.name.lower()
         self.details[Key.TELEMETRY_REFUSED] = reason
-        self.details[Key.CALIBRATION] = window.calibration
+        self.details[Key.CALIBRATION], self.details[Key.PICTURE_PATH] = window.calibration, window.picture
+        if window.lost:
+            self.count(Key.PATHS_LOST)
         self._had_telemetry |= use is TelemetryUse.USED
-        words = _WORDS[use].format(reason)
-        refused = use is TelemetryUse.REFUSED or (self._had_telemetry and use is TelemetryUse.LATE)
+        words = _WORDS[use].format(reason) or (f"odom: {window.picture}" if window.picture else "")
+        refused = window.lost or use is TelemetryUse.REFUSED or (self._had_telemetry and use is TelemetryUse.LATE)
         self.report(WARN if refused else OK, f"{done}; {words}" if words else done)

@@ -27,6 +27,8 @@ from drocap_ros.srv import OrbitCommand
 
 #: The world's frame: ENU, z up.
 MAP = "map"
+#: Frame of a path by the picture alone (REP 105: continuous, but for a path that was lost, and it drifts).
+ODOM = "odom"
 
 
 def stamp_to_ros(stamp_ns: int) -> Time:
@@ -175,7 +177,7 @@ def window_to_ros(
     known_ns : stamps of the newest vehicle state and fixed points that it knew
     """
     in_map = window.in_map
-    frame_id = header.frame_id if in_map is None else MAP
+    frame_id = header.frame_id if in_map is None else ODOM if in_map.path else MAP
     poses = [
         pose3d_to_ros(
             header_at(stamp_ns, frame_id),
@@ -187,7 +189,7 @@ def window_to_ros(
             confidence=window.confidence[i],
             reprojection_rms_px=float(window.reprojection_rms_px[i]),
             camera_rotation=None if in_map is None else in_map.rotation[i],
-            metric=in_map is not None,
+            metric=in_map is not None and not in_map.path,
         )
         for i, stamp_ns in enumerate(window.stamp_ns)
     ]
@@ -204,6 +206,14 @@ def window_to_ros(
         telemetry_stamp=stamp_to_ros(known_ns[0]),
         background_stamp=stamp_to_ros(known_ns[1]),
     )
+
+
+def camera_transform(window: AdjustedWindow, child: str) -> TransformStamped:
+    """``odom`` -> optical frame, of the newest image of a window there."""
+    assert window.in_map is not None
+    rotation, position, _, _ = window.in_map
+    turn = quaternion_from_matrix(rotation[-1:].swapaxes(1, 2))[0]
+    return transform_to_ros(header_at(int(window.stamp_ns[-1]), ODOM), child, position[-1], turn)
 
 
 def pose3d_from_ros(message: Pose3D) -> tuple[np.ndarray, np.ndarray]:

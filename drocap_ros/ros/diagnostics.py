@@ -53,6 +53,8 @@ class Key:
     FRAME = "frame"  # of pose3d/latest
     TELEMETRY = "telemetry"  # use of the camera's reported poses in the last adjustment
     TELEMETRY_REFUSED = "telemetry_refused"  # why, in words
+    PICTURE_PATH = "picture_path"  # the camera's path in `odom`, or why there is none, in words
+    PATHS_LOST = "paths_lost"
     CALIBRATION = "calibration"  # constant errors of the telemetry by fixed points, in words; empty = not used
     VEHICLE_STATES, SUBJECT_SEEN = "vehicle_states", "subject_seen"
     ORBIT_COMMANDS, ORBIT_COMMANDS_REFUSED = "orbit_commands", "orbit_commands_refused"

@@ -100,7 +100,7 @@ NODES: dict[str, NodeEntry] = {
     "capture_simulator": NodeEntry(("pose2d", "camera_info"), source=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(
-        ("pose3d/refined", "pose3d/latest"),
+        ("pose3d/refined", "pose3d/latest", *_TF),
         ("pose2d", "pose3d/initial", "background", "vehicle/state", "camera_info"),
         live=True,
         niceness=15,

@@ -35,6 +35,8 @@ _WAITING = 300
 #: Points kept of the camera's path, and the distance between two of them, m: 60 m, more than an orbit of 9 m.
 _PATH_POINTS = 600
 _PATH_STEP_M = 0.1  # m
+#: Frames of poses that stand in a world; those of others are about the pelvis, in camera axes.
+_WORLDS = ("map", "odom")
 #: Farthest state of the vehicle that is used for an image, ns; a judgement.
 _NEAR_NS = 500_000_000
 #: A refined pose is drawn when images this much later, ns, hardly change it.
@@ -178,7 +180,7 @@ class MessageView:
         covariance = None
         if len(message.covariance) == 6 * count:
             covariance = float_array(message.covariance, (count, 6), "covariance").astype(float)
-        if message.header.frame_id.rsplit("/", 1)[-1] != "map":
+        if message.header.frame_id.rsplit("/", 1)[-1] not in _WORLDS:
             rotation, shift = self._place(message, joints_of, joints, draw_camera=stage != "refined")
             joints = joints @ rotation + shift
             covariance = None if covariance is None else _turned(covariance, rotation.T)

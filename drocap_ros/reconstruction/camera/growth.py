@@ -121,17 +121,18 @@ class Growth:
     def grow(self, most: int) -> Grown:
         """Place keyframes on both sides until ``most`` are known or no more can be placed; adjust now and then."""
         due = _FIRST_KEYS
-        while int(self.path.known.sum()) < most:
-            keys = self._next_keys()
-            placed = [key for key in keys if self._place(key)]
-            if not placed:
-                break
+        while int(self.path.known.sum()) < most and self.extend():
             if self.path.known.sum() >= due:
                 self.adjust()
                 due = int(_GROWTH * self.path.known.sum())
         if self.path.known.sum() > 2:
             self.adjust()
         return self.path
+
+    def extend(self) -> bool:
+        """Place the next keyframes by the points of the known ones; whether any could be placed."""
+        placed = [self._place(key) for key in self._next_keys()]
+        return any(placed)
 
     def _next_keys(self) -> list[int]:
         """Keyframes to try: those inside a pair first, then the next ones outside, or beyond a gap."""

@@ -20,8 +20,9 @@ from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.method import WindowSolution, prepare, solve_window
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled
+from drocap_ros.reconstruction.live.picture_windows import PictureWindows
 from drocap_ros.reconstruction.live.stream_lifter import person_size
-from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, Window
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, TelemetryUse, Window
 from drocap_ros.reconstruction.live.world_windows import WorldWindows
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.reconstruction.person_view import person_view
@@ -46,7 +47,7 @@ class LiveAdjuster:
         prepare(lifted_config(config, drawn_toes=True))
         self._config = config
         self._known: tuple[int, np.ndarray, BodySize] | None = None
-        self._world = WorldWindows(config)
+        self._world, self._picture = WorldWindows(config), PictureWindows(config)
 
     def adjust(
         self, window: Window, effort: Effort | None = None, cancelled: Cancelled | None = None
@@ -94,6 +95,8 @@ class LiveAdjuster:
                 config = replace(config, first_iterations=steps[0], iterations=steps[1])
             again, found = self._solve(w, None, config, effort, None)
             final = replace(again, effort=result.effort, telemetry=final.telemetry, reason=final.reason)
+        if final.telemetry is TelemetryUse.NONE:
+            final = self._picture.adjust(w, found, final)
         if len(w.stamp_ns) * effort.stride >= WARM_FRAMES:
             self._known = (w.subject, w.stamp_ns, found.body)
         return final

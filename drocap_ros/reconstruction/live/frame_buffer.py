@@ -78,6 +78,7 @@ class FrameBuffer:
             ),
             np.array([joints[:count] for _, joints in self._frames], np.float64),
             self.subject,
+            image_size=observations[-1].image_size,
             assumed_focal_px=assumed_focal_px(observations[-1].image_size, self._config.assumed_focal),
         )
 

@@ -67,7 +67,7 @@ class LatestPlace:
 
     def set_solution(self, window: AdjustedWindow, stamp_ns: int) -> None:
         """Take a window's solution from the image of ``stamp_ns`` on."""
-        if window.in_map is None:
+        if window.in_map is None or window.in_map.path:
             self._solution = self._before = None
             return
         solution = _Solution(window.in_map.correction, self._factor(window), window.covariance[-1, 0])

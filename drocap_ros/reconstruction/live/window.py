@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.background import Background
+from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
 
@@ -26,6 +27,7 @@ class Window(NamedTuple):
     camera : as reported; None = unknown
     assumed_focal_px : of the lens where the camera is unknown; None = distant
     background : fixed points of the scene in its images; None = there are none
+    image_size : width and height px
     """
 
     stamp_ns: np.ndarray
@@ -35,6 +37,13 @@ class Window(NamedTuple):
     camera: WindowCamera | None = None
     assumed_focal_px: float | None = None
     background: Background | None = None
+    image_size: tuple[int, int] = (0, 0)
+
+    @property
+    def height_m(self) -> float:
+        """Stature that the initial poses assume."""
+        known = np.isfinite(self.initial_joints).all(axis=(1, 2))
+        return float(np.median(limb_lengths(self.initial_joints[known]).sum(axis=-1)) / LIMBS_PER_STATURE)
 
     def every(self, stride: int) -> Window:
         """Every ``stride``-th frame, counted back from the newest."""
@@ -101,28 +110,31 @@ class TelemetryUse(Enum):
 
 
 class InMap(NamedTuple):
-    """The camera of a window in ``map``.
+    """The camera of a window in ``map``, or in ``odom``, the frame of a path by the picture alone.
 
     rotation : (F, 3, 3) world -> camera; position : (F, 3) m; both adjusted
     correction : (6,) of the newest frame: position (m) and rotation vector (rad, camera axes) that correct the
         reported ones
+    path : 0 = in ``map``, else the number of the path in ``odom``
     """
 
     rotation: np.ndarray
     position: np.ndarray
     correction: np.ndarray
+    path: int = 0
 
 
 @dataclass(frozen=True)
 class AdjustedWindow:
     """Poses of a window: joints3d (F, 17, 3) m and covariance (F, 17, 6) m^2.
 
-    They are in camera axes with the pelvis at the origin, or, where ``in_map`` is known, in ``map`` (ENU) and metric;
-    then only the frames with a result there are in the window.
+    They are in camera axes with the pelvis at the origin, or, where ``in_map`` is known, in ``map`` (ENU) and metric,
+    or in ``odom`` (z up); then only the frames with a result there are in the window.
 
     effort : repeats the adjustment bit for bit
     telemetry : use of the reported camera; reason : in words, why it was refused
     calibration : in words, the constant errors of the reports by fixed points; "" = they were not used
+    picture : in words, the path by the picture alone, or why there is none; lost : whether it has just ended
     """
 
     stamp_ns: np.ndarray
@@ -138,4 +150,6 @@ class AdjustedWindow:
     telemetry: TelemetryUse = TelemetryUse.NONE
     reason: str = ""
     calibration: str = ""
+    picture: str = ""
+    lost: bool = False
     in_map: InMap | None = None

@@ -9,7 +9,6 @@ import numpy as np
 
 from drocap_ros.background import Background
 from drocap_ros.contacts import ANKLES
-from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
@@ -79,7 +78,7 @@ class WorldWindows:
             return self._refused(camera_result, refusal)
         reported = _tracks(stamps, keypoints, camera, None if w.background is None else w.frames(use).background)
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
-        refined = self._refined(reported, keypoints, poses, _assumed_height(w.initial_joints))
+        refined = self._refined(reported, keypoints, poses, w.height_m)
         if isinstance(refined, Refusal):
             return self._refused(camera_result, refined)
         if refined is None:
@@ -176,9 +175,3 @@ def _correction(refined: RefinedWorld, tracks: Tracks) -> np.ndarray:
     assert tracks.camera_position is not None
     turned = refined.rotation[-1:] @ np.swapaxes(tracks.camera_rotation[-1:], 1, 2)
     return np.concatenate([refined.position[-1] - tracks.camera_position[-1], log_so3(turned)[0]])
-
-
-def _assumed_height(initial: np.ndarray) -> float:
-    """Stature (m) that the initial poses (F, 17, 3) m assume."""
-    known = np.isfinite(initial).all(axis=(1, 2))
-    return float(np.median(limb_lengths(initial[known]).sum(axis=-1)) / LIMBS_PER_STATURE)

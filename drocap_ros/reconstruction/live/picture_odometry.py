@@ -1,0 +1,250 @@
+"""Live windows without telemetry: the camera's path by fixed points alone, in a frame ``odom`` of the picture's own.
+
+A path begins as a recording's does (``camera/picture_world.py``): upright, in metres by the body.  The next window goes
+on with it: new keyframes are placed by its points, as a path grows offline, and images that both windows have keep
+their camera.  Where that fails, the path is lost, and another one begins at the last place and heading of the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import project_to_so3
+from drocap_ros.reconstruction.camera.from_picture import fits
+from drocap_ros.reconstruction.camera.fusion import joints_by_camera
+from drocap_ros.reconstruction.camera.growth import Grown, Growth, adjusted, turns
+from drocap_ros.reconstruction.camera.kinds import Kind, cut_at, kind_of
+from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ, Knots
+from drocap_ros.reconstruction.camera.picture_world import PictureWorld, picture_camera, with_camera
+from drocap_ros.reconstruction.camera.sightings import Sightings
+from drocap_ros.reconstruction.camera.views import views_of
+from drocap_ros.reconstruction.common.poses import ImagePoses
+from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.person_view import true_shape
+from drocap_ros.reconstruction.world.placement import metres_per_px
+from drocap_ros.reconstruction.world.world_model import WorldConfig
+from drocap_ros.tracks import Tracks
+
+#: Shortest window (s) in which a path begins: a step and some way, and points in most of it.
+_FIRST_S = 3.0
+#: Time (s) after a search that found no path, until the next: it costs as much as some adjustments.
+_PAUSE_S = 4.0
+#: Steps of a path that goes on: most of it is known.
+_STEPS = 5
+#: Error (m) of a place on a path, as windows differ in it.
+_PLACE_M = 0.02
+#: Time (s) at a window's end in which a keyframe has to be placed.
+_NEWEST_S = 0.5
+
+
+@dataclass(frozen=True)
+class PicturePath:
+    """A window's camera in ``odom``; F images.
+
+    tracks : with the camera; world : how it was found, with up, metres and their deviations; number : of the path
+    begun_ns : stamp of the path's first image; drift_m, drift_rad : deviation of place and turn within a second
+    """
+
+    tracks: Tracks
+    world: PictureWorld
+    number: int
+    begun_ns: int
+    drift_m: float
+    drift_rad: float
+
+    @property
+    def words(self) -> str:
+        """For people: what the camera does, and how well up and metres are known."""
+        upright = self.world.upright
+        assert upright is not None
+        scale = f", metres to {100 * upright.scale_std:.0f} %" if np.isfinite(upright.scale_std) else ""
+        return f"path {self.number}, {self.world.camera.kind.value}; up to {upright.std_deg:.1f} deg{scale}"
+
+
+class PictureOdometry:
+    """Follows the camera from window to window; memory is that of a window."""
+
+    def __init__(self) -> None:
+        self._path: PicturePath | None = None
+        #: Where the last path ended: position (3,) m and rotation (3, 3) of the camera.
+        self._place: tuple[np.ndarray, np.ndarray] | None = None
+        #: First image, by its stamp, of the next path, and of the next search for one.
+        self.since_ns = self._retry_ns = 0
+        self._number = 0
+        #: Why there is no path, in words.
+        self.lost = ""
+
+    def follow(self, tracks: Tracks, poses: ImagePoses, height_m: float, config: WorldConfig) -> PicturePath | None:
+        """The path in a window with fixed points; None = there is none, ``lost`` says why.
+
+        tracks : with the camera's matrix where it is calibrated; poses : of a person of ``height_m``
+        """
+        before, stamps = self._path, tracks.stamp_ns
+        if before is not None:
+            shared = stamps[0] <= before.tracks.stamp_ns[-1]
+            self._path = _continued(before, tracks) if shared else None
+            if self._path is None:
+                self._lose(before, tracks, shared)
+        elif stamps[-1] >= self._retry_ns and stamps[-1] - stamps[0] >= _FIRST_S * 1e9:
+            self._path = self._begun(tracks, poses, height_m, config)
+        return self._path
+
+    def _lose(self, path: PicturePath, tracks: Tracks, shared: bool) -> None:
+        last = path.tracks
+        assert last.camera_position is not None
+        assert last.camera_rotation is not None
+        self._place = last.camera_position[-1], last.camera_rotation[-1]
+        seen = _Seen(tracks)
+        cut = cut_at(seen.sightings)
+        at = int(last.stamp_ns[-1]) if cut is None else int(tracks.stamp_ns[seen.image[seen.knots.frame[cut]]])
+        why = "a cut" if cut is not None else seen.kind(last).value if shared else "a pause"
+        self.since_ns, self.lost = at, f"path {path.number} lost: {why}; another one begins at its end"
+
+    def _begun(self, tracks: Tracks, poses: ImagePoses, height_m: float, config: WorldConfig) -> PicturePath | None:
+        """A path that begins in this window."""
+        camera = picture_camera(tracks)
+        if camera is None or not camera.kind.known:
+            self._retry_ns = int(tracks.stamp_ns[-1]) + round(_PAUSE_S * 1e9)
+            self.lost = "too few images" if camera is None else f"no path: {camera.kind.value}"
+            return None
+        tracks = replace(tracks, camera_matrix=camera.matrix)
+        per_px = metres_per_px(true_shape(poses.in_image, camera.matrix), tracks.stamp_ns, height_m)
+        tracks, world = with_camera(tracks, camera, poses, per_px, config)
+        if self._place is not None:
+            tracks = _from(tracks, *self._place)
+        self._number, self.lost = self._number + 1, ""
+        scale = _way(tracks) / max(float(np.linalg.norm(np.ptp(camera.position, axis=0))), 1e-9)
+        drift = np.nan_to_num([scale * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)
+        return PicturePath(tracks, world, self._number, int(tracks.stamp_ns[0]), float(drift[0]), float(drift[1]))
+
+
+class _Seen:
+    """Fixed points of a window at its keyframes; image : (frames,) of each evenly spaced frame, -1 = there is none."""
+
+    def __init__(self, tracks: Tracks) -> None:
+        points = tracks.background
+        assert points is not None
+        slot, self.fps = even_slots(tracks.stamp_ns)
+        self.slot, self.image = slot, np.full(int(slot[-1]) + 1, -1)
+        self.image[slot] = np.arange(len(slot))
+        frames = len(self.image)
+        self.knots = Knots(frames, self.fps)
+        views = views_of(slot[points.frame], points.track, points.point.astype(np.float64), frames, self.fps)
+        self.sightings = Sightings(views, self.knots.frame)
+
+    def kind(self, last: Tracks) -> Kind:
+        """What the camera does, through the lens of the window before."""
+        assert last.camera_matrix is not None
+        return kind_of(self.sightings, last.camera_matrix, 1.0 / self.knots.step_s, last.image_size[0])
+
+
+def _continued(before: PicturePath, tracks: Tracks) -> PicturePath | None:
+    """The path of the window before in a window that shares images with it; None = it is lost."""
+    last, seen = before.tracks, _Seen(tracks)
+    if cut_at(seen.sightings) is not None:
+        return None
+    found = _grown(seen, last, tracks.stamp_ns) if before.world.camera.kind is Kind.MOVES else None
+    if found is None:
+        found = _in_place(seen, last)
+    if found is None:
+        return None
+    rotation, position = _as_before(*found, last, tracks.stamp_ns)
+    tracks = replace(tracks, camera_rotation=rotation, camera_position=position, camera_matrix=last.camera_matrix)
+    return replace(before, tracks=tracks)
+
+
+def _in_place(seen: _Seen, last: Tracks) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rotations (F, 3, 3) and zero positions of a camera that keeps its place; None = it does not."""
+    assert last.camera_matrix is not None
+    place, kind = np.zeros((len(seen.slot), 3)), seen.kind(last)
+    if kind is Kind.STANDS:
+        return np.tile(np.eye(3), (len(place), 1, 1)), place
+    return (turns(seen.sightings, last.camera_matrix)[0][seen.slot], place) if kind is Kind.TURNS else None
+
+
+def _grown(seen: _Seen, last: Tracks, stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rotations and positions (F,) of a path that goes on, in a unit of its own; None = its points do not carry it."""
+    assert last.camera_rotation is not None
+    assert last.camera_position is not None
+    assert last.camera_matrix is not None
+    image = seen.image[seen.knots.frame]
+    known = (image >= 0) & np.isin(stamp_ns[image], last.stamp_ns)
+    theirs = np.searchsorted(last.stamp_ns, stamp_ns[image[known]])
+    rotation, position = np.tile(np.eye(3), (len(image), 1, 1)), np.zeros((len(image), 3))
+    rotation[known], position[known] = last.camera_rotation[theirs], last.camera_position[theirs]
+    if known.sum() < 2:
+        return None
+    growth = Growth(seen.sightings, Grown(rotation, position, known, last.camera_matrix), seen.fps, 0.0)
+    while not growth.path.known.all() and growth.extend():
+        pass
+    path = growth.path
+    found = adjusted(seen.sightings, path, seen.fps, 0.0, _STEPS)
+    newest = seen.knots.frame > len(seen.image) - 1 - _NEWEST_S * seen.fps
+    if found is None or not path.known[newest].any() or not fits(found, last.camera_matrix):
+        return None
+    keys = seen.knots.frame[path.known]
+    at = np.clip(seen.slot, keys[0], keys[-1]) - keys[0]
+    return found.rotation[at], found.position[at]
+
+
+def _as_before(
+    rotation: np.ndarray, position: np.ndarray, last: Tracks, stamp_ns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The path (F,) in the axes, at the place and in the metres that the images it shares with the last window have."""
+    assert last.camera_rotation is not None
+    assert last.camera_position is not None
+    here = np.flatnonzero(np.isin(stamp_ns, last.stamp_ns))
+    theirs = np.searchsorted(last.stamp_ns, stamp_ns[here])
+    turn = project_to_so3(np.einsum("fki,fkj->ij", last.camera_rotation[theirs], rotation[here]))
+    place, theirs_at = position[here] @ turn.T, last.camera_position[theirs]
+    # The path has the metres that it began with, but for what its adjustment shrinks: a way tells, noise does not.
+    spread, theirs_spread = (np.square(p - p.mean(axis=0)).sum(axis=1).mean() for p in (place, theirs_at))
+    scale = float(np.sqrt((theirs_spread + _PLACE_M**2) / (spread + _PLACE_M**2)))
+    moved = scale * (position @ turn.T - place.mean(axis=0)) + theirs_at.mean(axis=0)
+    return rotation @ turn.T, moved
+
+
+def _from(tracks: Tracks, position: np.ndarray, rotation: np.ndarray) -> Tracks:
+    """A path turned about the vertical and moved across it, so that its first image has that place and heading."""
+    turns_, path = tracks.camera_rotation, tracks.camera_position
+    assert turns_ is not None
+    assert path is not None
+    ahead, wanted = _heading(turns_[0]), _heading(rotation)
+    c, s = np.cos(wanted - ahead), np.sin(wanted - ahead)
+    about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    moved = path @ about.T
+    moved[:, :2] += position[:2] - moved[0, :2]
+    return replace(tracks, camera_rotation=turns_ @ about.T, camera_position=moved)
+
+
+def _heading(rotation: np.ndarray) -> float:
+    """Angle (rad) of a camera's axis (3, 3) in the level plane, or of its image's top where it looks down."""
+    ahead = rotation[2] if np.hypot(*rotation[2, :2]) > np.hypot(*rotation[1, :2]) else -rotation[1]
+    return float(np.arctan2(ahead[1], ahead[0]))
+
+
+def _way(tracks: Tracks) -> float:
+    assert tracks.camera_position is not None
+    return float(np.linalg.norm(np.ptp(tracks.camera_position, axis=0)))
+
+
+def own_covariance(path: PicturePath, joints: np.ndarray, stature_std: float) -> np.ndarray:
+    """(F, P, 3, 3) m^2 of joints (F, P, 3) m in ``odom`` by what is unknown of the path: up, metres and drift."""
+    tracks, upright = path.tracks, path.world.upright
+    assert upright is not None
+    assert tracks.camera_rotation is not None
+    assert tracks.camera_position is not None
+    moves = np.isfinite(upright.scale_std)
+    # A way has an unknown factor as a whole; without one the distance of a person of unknown stature is unknown.
+    arm = joints if moves else joints - tracks.camera_position[:, None]
+    out = (upright.scale_std if moves else stature_std) ** 2 * arm[..., :, None] * arm[..., None, :]
+    x, y, z = np.moveaxis(joints, -1, 0)
+    none = np.zeros_like(x)
+    for tilted in (np.stack([none, -z, y], axis=-1), np.stack([z, none, -x], axis=-1)):
+        out += np.deg2rad(upright.std_deg) ** 2 * tilted[..., :, None] * tilted[..., None, :]
+    lever = joints_by_camera(joints, tracks.camera_rotation, tracks.camera_position)
+    seconds = np.maximum(tracks.stamp_ns - path.begun_ns, 0) * 1e-9
+    drift = seconds[:, None] * np.repeat([path.drift_m, path.drift_rad], 3) ** 2
+    return np.asarray(out + (lever * drift[:, None, None]) @ np.swapaxes(lever, -1, -2))

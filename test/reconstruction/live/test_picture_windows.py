@@ -1,0 +1,103 @@
+"""Live windows without telemetry: in ``odom`` by fixed points, lost and begun anew with a word."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from telemetry_stream import FPS, Orbit, orbit
+
+from drocap_ros.background import Background
+from drocap_ros.evaluation.compare import world_errors
+from drocap_ros.geometry.camera_history import CameraHistory
+from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.live.replay import LiveWindow, live_poses
+from drocap_ros.reconstruction.live.window import TelemetryUse
+
+S = 10**9
+
+
+def windows(true: Orbit, points_at: Callable[[np.ndarray], Background | None]) -> list[LiveWindow]:
+    """The windows of a stream with a calibration and without any pose of the camera."""
+    lens = CameraHistory(60.0)
+    lens.add_matrix(int(true.stamp_ns[0]), true.matrix)
+    results = live_poses(
+        true.observations, InitializerConfig(), BundleAdjusterConfig(), camera_at=lens.along, points_at=points_at
+    )
+    return [result for result in results if isinstance(result, LiveWindow)]
+
+
+@lru_cache(maxsize=1)
+def flown() -> Orbit:
+    return orbit(9.0)
+
+
+def camera_of(w: LiveWindow) -> tuple[np.ndarray, np.ndarray]:
+    assert w.window.in_map is not None
+    return w.window.in_map.rotation, w.window.in_map.position
+
+
+def test_windows_are_in_a_world_of_the_picture_with_its_up_and_metres() -> None:
+    true = flown()
+    found = windows(true, true.points_at)
+    there = [w for w in found if w.window.in_map is not None]
+    assert {w.window.telemetry for w in found} == {TelemetryUse.NONE}
+    assert (there[0].window.stamp_ns[-1] - true.stamp_ns[0]) * 1e-9 < 4.0
+    assert there == found[-len(there) :]
+    for w in there:
+        place = np.searchsorted(true.stamp_ns, w.window.stamp_ns)
+        rotation, _ = camera_of(w)
+        errors = world_errors(w.joints3d.astype(float), true.truth[place], FPS)
+        # The vertical, seen by the camera, against the true one.
+        tilt = np.degrees(np.arccos(np.clip(np.sum(rotation[..., 2] * true.rotation[place][..., 2], axis=1), -1, 1)))
+        assert tilt.max() < 3.0
+        assert errors.wa_mm < 100.0
+        assert abs(errors.scale) < 0.08
+        std = np.sqrt(np.trace(unpack_covariance(w.window.covariance[:, 0]), axis1=1, axis2=2) / 3)
+        assert (errors.wa_mm < 3000.0 * std).all()
+        assert (std < 0.6).all()
+    for before, after in itertools.pairwise(there):
+        _, at, here = np.intersect1d(before.window.stamp_ns, after.window.stamp_ns, return_indices=True)
+        step = np.linalg.norm(camera_of(before)[1][at] - camera_of(after)[1][here], axis=1)
+        assert step.max() < 0.1
+        assert "path 1" in after.window.picture
+
+
+def test_a_path_that_a_cut_ends_is_told_and_the_next_one_begins_at_its_place() -> None:
+    true, other = flown(), orbit(9.0, seed=3)
+    cut_ns = int(true.stamp_ns[0]) + 5 * S
+    cut = int(np.searchsorted(true.stamp_ns, cut_ns))
+    scenes = true.background, other.background
+    parts = [scene.of_frames(np.arange(len(true.stamp_ns))[use]) for scene, use in
+             zip(scenes, (slice(0, cut), slice(cut, None)), strict=True)]  # fmt: skip
+    both = Background(
+        np.concatenate([parts[0].frame, parts[1].frame + cut]).astype(np.int32),
+        np.concatenate([parts[0].track, parts[1].track + 10**6]),
+        np.concatenate([parts[0].point, parts[1].point]),
+    )
+    stream = replace(true, observations=[*true.observations[:cut], *other.observations[cut:]])
+    found = windows(stream, lambda stamps: both.of_frames(np.searchsorted(stream.stamp_ns, stamps)))
+    paths = [0 if w.window.in_map is None else w.window.in_map.path for w in found]
+    assert set(paths) == {0, 1, 2}
+    assert paths == sorted(paths[: paths.index(2)], key=lambda path: path > 1) + [2] * paths.count(2)
+    lost = [w for w in found if w.window.lost]
+    assert len(lost) == 1
+    assert "path 1 lost: a cut" in lost[0].window.picture
+    last, first = found[max(i for i, p in enumerate(paths) if p == 1)], found[paths.index(2)]
+    assert first.window.stamp_ns[0] >= cut_ns
+    # Where the camera was, though its scene is another one.
+    np.testing.assert_allclose(camera_of(first)[1][0, :2], camera_of(last)[1][-1, :2], atol=0.2)
+
+
+def test_without_texture_there_is_no_path_and_the_poses_stay_with_the_camera() -> None:
+    true = flown()
+    few = Background(*(values[true.background.track % 40 == 0] for values in
+                       (true.background.frame, true.background.track, true.background.point)))  # fmt: skip
+    found = windows(true, lambda stamps: few.of_frames(np.searchsorted(true.stamp_ns, stamps)))
+    assert all(w.window.in_map is None for w in found)
+    assert "too few fixed points" in found[-1].window.picture
+    assert np.abs(found[-1].joints3d[:, 0]).max() < 1e-9
