@@ -37,11 +37,15 @@ def test_the_same_motion_gives_the_same_bytes(folder):
 
 
 def write_video(path, motion, rate_hz):
-    width, height = (int(side) + 20 for side in np.nanmax(motion.keypoints, axis=(0, 1)))
+    width, height = motion.meta.get("images", {}).get("size") or size_around(motion)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate_hz, (width, height))
     for _ in motion.stamp_ns:
         writer.write(np.full((height, width, 3), 90, np.uint8))
     writer.release()
+
+
+def size_around(motion):
+    return tuple(int(side) + 20 for side in np.nanmax(motion.keypoints, axis=(0, 1)))
 
 
 def own_rate_hz(motion):
@@ -98,9 +102,7 @@ def test_mp4_shows_the_video_with_the_body_beside_the_body_in_3d(person, folder,
     picture = video.read()[1].astype(int)
     # Left: white joints on the grey video, each at its keypoint.
     width = picture.shape[1] - 720
-    x0, y0, x1, y1 = subject_box(
-        person.keypoints, *(int(side) + 20 for side in np.nanmax(person.keypoints, axis=(0, 1)))
-    )
+    x0, y0, x1, y1 = subject_box(person.keypoints, *size_around(person))
     scale = min(width / (x1 - x0), 720 / (y1 - y0))
     middle = 0.5 * np.array([x0 + x1, y0 + y1])
     for x, y in np.round((person.keypoints[frame] - middle) * scale + [width / 2, 360]).astype(int):
@@ -144,6 +146,20 @@ def test_reconstruct_ends_in_a_report(tmp_path, capsys):
     bare = tmp_path / "bare"
     assert main([*command[:3], str(bare), *command[4:], "--no-report", "--quiet"]) == 0
     assert not (bare / "report.html").exists()
+
+
+def test_a_second_reconstruction_keeps_the_images_of_the_report(tmp_path):
+    save_tracks(tmp_path / "tracks.npz", simulate_capture(1.0, 15.0, seed=1).tracks)
+    out = tmp_path / "out"
+    command = ["reconstruct", str(tmp_path / "tracks.npz"), "--out", str(out), "--method", "initial", "--quiet"]
+    assert main(command) == 0
+    motion = load_motion(out)
+    write_video(tmp_path / "clip.avi", motion, own_rate_hz(motion))
+    assert main(["report", str(out), "--video", str(tmp_path / "clip.avi"), "--quiet"]) == 0
+    pictures = images_in(out / "report.html")
+    assert len(pictures) == 15
+    assert main(command) == 0
+    assert images_in(out / "report.html") == pictures
 
 
 def test_reconstruct_shows_the_pictures_of_its_video(shared, tmp_path):
