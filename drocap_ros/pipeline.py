@@ -170,7 +170,12 @@ def reconstruct_together(
         solved.append(
             solve_view(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress)
         )
+    begin = time.perf_counter()
     motions = join_views(solved, [path.name for path in paths], config.bundle_adjuster.threads)
+    took = time.perf_counter() - begin
+    for motion in motions:
+        alone = motion.meta["seconds"]
+        motion.meta["seconds"] = {**alone, "together": took, "total": alone["total"] + took}
     return [(_with_origin(motion, *of), of[1]) for motion, of in zip(motions, read, strict=True)]
 
 

@@ -45,6 +45,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_tracks(folder / "left.npz", seen_from(0.0, time_s))
     right = seen_from(100.0, time_s[:-40] + LATER_S)
     save_tracks(folder / "right.npz", replace(right, stamp_ns=right.stamp_ns + _CLOCK_NS))
+    save_tracks(folder / "no_lens.npz", replace(right, camera_matrix=None))
     save_tracks(folder / "other.npz", seen_from(100.0, time_s, "squats"))
     return folder
 
@@ -94,6 +95,7 @@ def test_a_recording_of_another_motion_is_refused_by_its_name(
         (["left.npz", "right.npz", "--together", "--start", "1"], "--start"),
         (["left.npz", "right.npz", "--together", "--method", "paper"], "--method"),
         (["left.npz", "missing.npz", "--together"], "no such file"),
+        (["left.npz", "no_lens.npz", "--together"], "no_lens.npz: expected a known lens"),
     ],
 )
 def test_what_does_not_fit_together_is_one_line(

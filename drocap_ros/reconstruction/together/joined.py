@@ -40,7 +40,7 @@ def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> 
     InputError
         When two recordings do not show the same motion at any time.
     """
-    views = [View.of(one) for one in solved]
+    views = [View.of(one, name) for one, name in zip(solved, names, strict=True)]
     first = views[0]
     offsets, placed = [TimeOffset(0.0, 1.0, 0.0)], [Placement(1.0, np.eye(3), np.zeros(3), 0.0)]
     for name, view in zip(names[1:], views[1:], strict=True):
@@ -56,7 +56,7 @@ def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> 
 
 def _best_fit(first: View, view: View, name: str, to: str) -> tuple[TimeOffset, Placement]:
     """Offset and place of a view: of the times at which the motions are alike, that at which the bodies fit best."""
-    found = time_offsets(first.joints, view.joints, (first.time_s, view.time_s))
+    found = time_offsets(first.shown(), view.shown())
     if not found or found[0].likeness < _LEAST_LIKENESS:
         alike = f"a likeness of {found[0].likeness:.2f}" if found else "too short a time"
         raise InputError(

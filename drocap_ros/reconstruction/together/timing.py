@@ -19,6 +19,8 @@ _FAST_S = 0.03
 LEAST_S = 2.0
 #: Joints whose heights above the pelvis and whose distances from each other are compared.
 _MOVING = ("head", "rwrist", "lwrist", "relbow", "lelbow", "rknee", "lknee", "rankle", "lankle")
+#: Longest time (s) without the person that is bridged.
+_HIDDEN_S = 0.3
 #: Weight of a distance against that of a height: depths of a single view err.
 _DISTANCE_WEIGHT = 0.3
 #: Time (s) between two different answers: motions repeat themselves after a step at the earliest.
@@ -37,15 +39,20 @@ class TimeOffset(NamedTuple):
     next_best: float
 
 
-def time_offsets(first: np.ndarray, second: np.ndarray, times: tuple[np.ndarray, np.ndarray]) -> list[TimeOffset]:
-    """Offsets under which two motions are most alike, best first, at most four.
+class ShownMotion(NamedTuple):
+    """A motion of F images.
 
-    Parameters
-    ----------
-    first, second : (F, 17, 3), (G, 17, 3) m, z up
-    times : (F,), (G,) s, each on its own clock
+    joints : (F, 17, 3) m, z up; time_s : (F,) on a clock of its own; seen : (F,) whether an image shows the person
     """
-    a, b = (_signals(joints, time) for joints, time in zip((first, second), times, strict=True))
+
+    joints: np.ndarray
+    time_s: np.ndarray
+    seen: np.ndarray
+
+
+def time_offsets(first: ShownMotion, second: ShownMotion) -> list[TimeOffset]:
+    """Offsets under which two motions are most alike, best first, at most four."""
+    a, b = _signals(first), _signals(second)
     score = _correlations(a, b)
     if score is None:
         return []
@@ -54,16 +61,20 @@ def time_offsets(first: np.ndarray, second: np.ndarray, times: tuple[np.ndarray,
     found: list[TimeOffset] = []
     while len(found) < 4 and left.max() > 0.0:
         best = int(left.argmax())
-        seconds = (lag[best] + _peak(score, best)) / RATE_HZ + times[0][0] - times[1][0]
+        seconds = (lag[best] + _peak(score, best)) / RATE_HZ + first.time_s[0] - second.time_s[0]
         left[max(best - round(_APART_S * RATE_HZ), 0) : best + round(_APART_S * RATE_HZ) + 1] = 0.0
         found.append(TimeOffset(float(seconds), float(score[best]), float(left.max())))
     return found
 
 
-def _signals(joints: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """(N, K) heights and distances of joints at ``RATE_HZ``, without what is slow: the same in every level view."""
+def _signals(motion: ShownMotion) -> np.ndarray:
+    """(N, K) heights and distances of joints at ``RATE_HZ``, without what is slow: the same in every level view.
+
+    They are 0 where no image shows the person.
+    """
     from scipy.ndimage import gaussian_filter1d
 
+    joints, time = motion.joints, motion.time_s
     at = indices(BODY_17.joints, _MOVING)
     one, other = np.triu_indices(len(at), 1)
     distance = np.linalg.norm(joints[:, at[one]] - joints[:, at[other]], axis=-1)
@@ -72,27 +83,31 @@ def _signals(joints: np.ndarray, time: np.ndarray) -> np.ndarray:
     values = np.stack([np.interp(even, time, column) for column in values.T], axis=1)
     smooth = max(_FAST_S, usual_step(time)) * RATE_HZ
     values = gaussian_filter1d(values, smooth, axis=0, mode="nearest")
-    return np.asarray(values - gaussian_filter1d(values, _SLOW_S * RATE_HZ, axis=0, mode="nearest"))
+    values -= gaussian_filter1d(values, _SLOW_S * RATE_HZ, axis=0, mode="nearest")
+    shown = np.concatenate([[-np.inf], time[motion.seen], [np.inf]])
+    after = np.searchsorted(shown, even)
+    values[shown[after] - shown[after - 1] > _HIDDEN_S] = 0.0
+    return np.asarray(values)
 
 
 def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
     """(N + M - 1,) correlation of the signals for every lag of b in a; 0 where they overlap too little."""
     from scipy.signal import fftconvolve
 
-    least = min(LEAST_S * RATE_HZ, len(a), len(b))
-    if least < 0.5 * LEAST_S * RATE_HZ:
-        return None
     back = b[::-1]
+    ones_a, ones_b = (signals.any(axis=1).astype(np.float64) for signals in (a, back))
+    shorter = min(ones_a.sum(), ones_b.sum())
+    if shorter < LEAST_S * RATE_HZ:
+        return None
     together = fftconvolve(a, back, axes=0).sum(axis=1)
-    ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
     energy_a = fftconvolve(np.square(a).sum(axis=1), ones_b)
     energy_b = fftconvolve(ones_a, np.square(back).sum(axis=1))
-    overlap = fftconvolve(ones_a, ones_b)
-    usual = 0.1 * max(np.square(a).sum() / len(a), np.square(b).sum() / len(b)) * overlap
+    overlap = np.maximum(fftconvolve(ones_a, ones_b), 0.0)
+    usual = 0.1 * max(np.square(a).sum() / ones_a.sum(), np.square(b).sum() / ones_b.sum()) * overlap
     score = together / np.sqrt(np.maximum(energy_a, usual) * np.maximum(energy_b, usual) + 1e-12)
     # A long time together says more than a short one that is as alike.
-    score *= np.minimum(1.0, overlap / min(len(a), len(b))) ** 0.25
-    return np.where(overlap >= least - 0.5, score, 0.0)
+    score *= np.minimum(1.0, overlap / shorter) ** 0.25
+    return np.where(overlap >= LEAST_S * RATE_HZ - 0.5, score, 0.0)
 
 
 def _peak(score: np.ndarray, best: int) -> float:

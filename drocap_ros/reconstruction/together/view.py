@@ -7,10 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.errors import InputError
 from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.geometry.rotations import project_to_so3
 from drocap_ros.motion import LEVEL_CAMERA
 from drocap_ros.reconstruction.reconstruct import SolvedView
+from drocap_ros.reconstruction.together.timing import ShownMotion
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.even_capture import keypoint_weights
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
@@ -57,8 +59,18 @@ class View:
     config: WorldConfig
 
     @staticmethod
-    def of(solved: SolvedView) -> View:
-        """The view of a recording that was solved alone."""
+    def of(solved: SolvedView, name: str) -> View:
+        """The view of a recording that was solved alone.
+
+        Raises
+        ------
+        InputError
+            When nothing is known of its lens.
+        """
+        if solved.tracks.camera_matrix is None:
+            raise InputError(
+                f"{name}: expected a known lens, found none; add camera_matrix to the tracks, or the video"
+            )
         motion, joints = solved.motion, solved.motion.joints3d[:, :17]
         if motion.frame == "world" and motion.camera_position is not None:
             rotation, position = motion.camera_rotation, motion.camera_position
@@ -81,6 +93,10 @@ class View:
         """(F,) s since the first image."""
         stamps = self.solved.tracks.stamp_ns
         return np.asarray((stamps - stamps[0]) * 1e-9)
+
+    def shown(self) -> ShownMotion:
+        """The motion with the images that show it."""
+        return ShownMotion(self.joints, self.time_s, np.asarray((self.solved.keypoints.weights > 0).any(axis=1)))
 
     @property
     def matrix(self) -> np.ndarray:
@@ -113,35 +129,28 @@ class View:
         """What the view shows at times (S,) s of its own clock; no weight where it shows nothing."""
         solved, own = self.solved, self.time_s
         after = np.clip(np.searchsorted(own, time_s), 1, len(own) - 1)
-        before = after - 1
-        gap = own[after] - own[before]
-        part = np.clip((time_s - own[before]) / gap, 0.0, 1.0)
-        inside = (time_s >= own[0]) & (time_s <= own[-1]) & (gap < max(_GAP_S, 1.5 * usual_step(own)))
-
-        def between(values: np.ndarray) -> np.ndarray:
-            share = part.reshape(-1, *(1,) * (values.ndim - 1))
-            return np.asarray(values[before] + share * (values[after] - values[before]))
-
+        step = _Between(own, after - 1, after, time_s)
         assert solved.poses.sigma_px is not None
-        weight = keypoint_weights(solved.keypoints, solved.poses.sigma_px[..., 0])
-        seen = solved.keypoints.weights > 0
-        points = np.where(seen[..., None], solved.keypoints.xy, _image(solved))
-        both = seen[before] == seen[after]  # a guess and a keypoint have no mean
+        weight, image = keypoint_weights(solved.keypoints, solved.poses.sigma_px[..., 0]), _image(solved)
+        # Keypoints have their own neighbours: a network may see a joint in every second image only.
+        joint = _seen_beside(solved.keypoints.weights > 0, after, own, time_s)
+        seen, guess = joint.inside, step.inside[:, None] & (solved.keypoints.weights[after - 1] == 0)
+        xy = np.where(seen[..., None], joint.of(np.nan_to_num(solved.keypoints.xy)), step.of(image))
+        guess &= ~seen & (solved.keypoints.weights[after] == 0)
         sigma, depth = self._depth()
         still = solved.poses.still
-        fps = 1.0 / usual_step(time_s)
         return WorldInput(
-            keypoints=between(points),
-            weight=np.where(inside[:, None] & both, np.minimum(weight[before], weight[after]), 0.0),
-            depth=between(depth),
+            keypoints=xy,
+            weight=np.where(seen, joint.least(weight), np.where(guess, step.least(weight), 0.0)),
+            depth=step.of(depth),
             # Where the view shows nothing its depths weigh nothing.
-            depth_sigma=np.where(inside[:, None], between(sigma), 1e6),
+            depth_sigma=np.where(step.inside[:, None], step.of(sigma), 1e6),
             lengths=np.zeros(0),
-            telemetry=CameraTelemetry(project_to_so3(between(self.turn)), between(self.path), fps),
+            telemetry=CameraTelemetry(project_to_so3(step.of(self.turn)), step.of(self.path), 1.0 / usual_step(time_s)),
             camera_matrix=self.matrix,
             config=replace(self.config, position_wander_m=max(self.config.position_wander_m, doubt.wander_m)),
-            seen=inside[:, None] & seen[before] & seen[after],
-            still=None if still is None else np.where(inside[:, None], between(still), 0.5),
+            seen=seen,
+            still=None if still is None else np.where(step.inside[:, None], step.of(still), 0.5),
             placed_m=doubt.placed_m,
             placed_deg=doubt.placed_deg,
         )
@@ -157,3 +166,46 @@ class View:
 def _image(solved: SolvedView) -> np.ndarray:
     """(F, 17, 2) px of the poses."""
     return np.asarray(solved.poses.joints_px[..., :2] + solved.poses.translation_px[:, None])
+
+
+class _Between:
+    """Interpolation between rows ``before`` and ``after`` of an image's values, (S,) or of every joint (S, P).
+
+    inside : whether both are near enough
+    """
+
+    def __init__(self, own_s: np.ndarray, before: np.ndarray, after: np.ndarray, time_s: np.ndarray) -> None:
+        self._rows = (
+            (before, after)
+            if before.ndim == 1
+            else ((before, np.arange(before.shape[1])), (after, np.arange(before.shape[1])))
+        )
+        time_s = time_s.reshape(-1, *(1,) * (before.ndim - 1))
+        gap = own_s[after] - own_s[before]
+        self._part = np.where(
+            gap > 0.0, np.clip((time_s - own_s[before]) / np.where(gap > 0.0, gap, 1.0), 0.0, 1.0), 0.0
+        )
+        near = gap < max(_GAP_S, 1.5 * usual_step(own_s))
+        self.inside = near & (time_s >= own_s[before]) & (time_s <= own_s[after])
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Interpolated values."""
+        before, after = (values[rows] for rows in self._rows)
+        share = self._part.reshape(*self._part.shape, *(1,) * (before.ndim - self._part.ndim))
+        return np.asarray(before + share * (after - before))
+
+    def least(self, values: np.ndarray) -> np.ndarray:
+        """The smaller of both."""
+        before, after = (values[rows] for rows in self._rows)
+        return np.asarray(np.minimum(before, after))
+
+
+def _seen_beside(seen: np.ndarray, after: np.ndarray, own_s: np.ndarray, time_s: np.ndarray) -> _Between:
+    """Between the nearest images (S, P) that show each joint; ``seen`` : (F, P)."""
+    frames = np.arange(len(seen))[:, None]
+    last = np.maximum.accumulate(np.where(seen, frames, -1), axis=0)[after - 1]
+    following = np.minimum.accumulate(np.where(seen, frames, len(seen))[::-1], axis=0)[::-1][after]
+    none = (last < 0) | (following >= len(seen))
+    between = _Between(own_s, np.where(none, 0, last), np.where(none, 0, following), time_s)
+    between.inside &= ~none
+    return between
