@@ -38,7 +38,8 @@ def write_bvh(path: Path, take: Take, *, names: str = "h36m", rest: str = "t") -
         out.write("\n".join(lines))
         out.write(f"\nMOTION\nFrames: {len(values)}\nFrame Time: {1.0 / take.rate_hz:.9f}\n")
         np.savetxt(out, values, fmt=_FORMAT)
-    return notes
+    colons = ("three.js animates no name with a colon: --names mixamo-three",) if names == "mixamo" else ()
+    return (*notes, *colons)
 
 
 def _joint(lines: list[str], columns: list[np.ndarray], rig: Rig, joint: int, depth: int) -> None:

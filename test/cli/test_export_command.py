@@ -33,7 +33,9 @@ def test_names_and_rest_pose_are_chosen_for_rigs_only(folder, capsys):
     options = ["--names", "mixamo", "--rest", "a", "--out", str(out)]
     assert main(["export", str(folder), "--to", "bvh", *options]) == 0
     assert "mixamorig:LeftForeArm" in READERS["bvh"](out).joints
-    assert "joints moved by" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "joints moved by" in said
+    assert "--names mixamo-three" in said
     options[1] = "mixamo-three"
     assert main(["export", str(folder), "--to", "bvh", *options]) == 0
     # Names that three.js accepts in the path of an animated property: its PropertyBinding reserves [ ] . : /
