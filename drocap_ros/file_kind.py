@@ -29,6 +29,8 @@ class FileKind(Enum):
 
 
 RECORDINGS = frozenset({FileKind.MCAP, FileKind.ROSBAG1, FileKind.SQLITE})
+#: First bytes of raw video: the only one whose head may look like text.
+_Y4M = b"YUV4MPEG2 "
 #: The first bytes of each kind, the first match counts.  Text that FFmpeg takes for a video (playlists, its terminal
 #: demuxer) is in no line.
 _HEADS = [
@@ -66,7 +68,9 @@ def file_kind(path: Path) -> FileKind:
         raise InputError(f"{path}: expected a readable file; {error.strerror or error}") from None
     if not head:
         return FileKind.EMPTY
-    found = next((kind for kind, pattern in _HEADS if pattern.match(head)), None)
+    found, begins = next(((kind, match[0]) for kind, pattern in _HEADS if (match := pattern.match(head))), (None, b""))
+    if found is FileKind.VIDEO and begins != _Y4M and _is_text(begins) and _is_text(head):
+        return FileKind.TEXT  # "The free text" begins as a box `free` does
     return found or (FileKind.TEXT if _is_text(head) else FileKind.OTHER)
 
 

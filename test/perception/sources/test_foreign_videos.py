@@ -17,7 +17,14 @@ cv2 = pytest.importorskip("cv2")
 
 
 @pytest.mark.parametrize(
-    "text", ["a man walks\n" * 60, "#EXTM3U\n#EXTINF:1,\nother.mp4\n", "\x1b[42m   \x1b[0m\n" * 99]
+    "text",
+    [
+        "a man walks\n" * 60,
+        "#EXTM3U\n#EXTINF:1,\nother.mp4\n",
+        "\x1b[42m   \x1b[0m\n" * 99,
+        "The free text\n" + "\x1b[42m   \x1b[0m\n" * 99,
+        "GIF89a is a format\n" * 60,
+    ],
 )
 @pytest.mark.parametrize("name", ["notes.txt", "clip.mp4"])
 def test_text_is_no_video(tmp_path, capsys, text, name):
