@@ -50,6 +50,7 @@ class Selection:
     topic : of the images of a recording; empty: colour before grey, then that with most messages
     rate_hz : true rate of the images where a video plays them slower
     evidence : file of 3D poses of its images by another system
+    people : numbers of those whom :mod:`drocap_ros.people` reconstructs; empty = everybody
     threads : that share the work on the images; the result is the same with any number
     """
 
@@ -59,11 +60,12 @@ class Selection:
     topic: str = ""
     rate_hz: float | None = None
     evidence: Path | None = None
+    people: tuple[int, ...] = ()
     threads: int = field(default=2, compare=False)
 
 
 #: A person counts after a confirmation, s; whoever is first seen before a clip's end is counted by then.
-_COUNTED_S = 5.0
+COUNTED_S = 5.0
 _WHOLE, _FOUND = Selection(), Telemetry()
 
 
@@ -112,7 +114,7 @@ def reconstruct_input(
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
-    return _with_origin(motion, Path(path), tracks, origin, seconds), tracks
+    return with_origin(motion, Path(path), tracks, origin, seconds), tracks
 
 
 def _with_own_camera(
@@ -131,7 +133,7 @@ def _with_own_camera(
     return with_attitude(tracks, telemetry.attitude_deg), origin
 
 
-def _with_origin(motion: Motion, path: Path, tracks: Tracks, origin: Values, seconds: float) -> Motion:
+def with_origin(motion: Motion, path: Path, tracks: Tracks, origin: Values, seconds: float) -> Motion:
     """A motion whose ``meta`` says what it was made from; ``seconds`` : of reading the input."""
     images = {"images": {"size": list(tracks.image_size)}}
     meta = {**motion.meta, "input": path.name, **images, **origin}
@@ -176,7 +178,7 @@ def reconstruct_together(
     for motion in motions:
         alone = motion.meta["seconds"]
         motion.meta["seconds"] = {**alone, "together": took, "total": alone["total"] + took}
-    return [(_with_origin(motion, *of), of[1]) for motion, of in zip(motions, read, strict=True)]
+    return [(with_origin(motion, *of), of[1]) for motion, of in zip(motions, read, strict=True)]
 
 
 def _reconstruct_live(path: Path, config: DrocapConfig, progress: Progress | None) -> tuple[Motion, Tracks]:
@@ -218,25 +220,31 @@ def read_input(
     selection: Selection = _WHOLE,
 ) -> tuple[Tracks, Values]:
     """2D tracks of the subject, of the input where it holds them, else of its images, and their origin for ``meta``."""
-    pitch, in_use = telemetry.mount_pitch_deg, telemetry.path != NO_TELEMETRY
     origin: Values = {} if selection.clip.whole else {"clip": selection.clip.meta}
     if needs_networks(path, selection.redetect):
         tracks, more = _track(path, config, models, progress, selection)
-        if is_recording(path):
-            with open_session(path) as session:
-                near = choose_images(session, selection.topic).name
-                session.warnings.clear()  # reported with the images
-                tracks = with_recorded_camera(session, tracks, near, pitch, telemetry=in_use)
-                _log_warnings(session)
-        return tracks, origin | more
+        return with_recorded(path, tracks, telemetry, selection), origin | more
     if path.suffix == ".npz":
         return selected_tracks(load_tracks(path), telemetry, selection), origin
     if selection.person is not None:
         raise InputError(f"--subject {selection.person}: expected images, found 2D poses of one person; add --redetect")
     with open_session(path) as session:
-        tracks = read_pose2d(session, pitch, telemetry=in_use)
+        tracks = read_pose2d(session, telemetry.mount_pitch_deg, telemetry=telemetry.path != NO_TELEMETRY)
         _log_warnings(session)
     return selection.clip.cut(tracks), {**origin, "pose2d": "recorded"}
+
+
+def with_recorded(path: Path, tracks: Tracks, telemetry: Telemetry, selection: Selection) -> Tracks:
+    """Tracks of an input's images with the camera that a recording holds."""
+    if not is_recording(path):
+        return tracks
+    with open_session(path) as session:
+        near = choose_images(session, selection.topic).name
+        session.warnings.clear()  # reported with the images
+        pitch, in_use = telemetry.mount_pitch_deg, telemetry.path != NO_TELEMETRY
+        tracks = with_recorded_camera(session, tracks, near, pitch, telemetry=in_use)
+        _log_warnings(session)
+    return tracks
 
 
 def selected_tracks(tracks: Tracks, telemetry: Telemetry, selection: Selection) -> Tracks:
@@ -277,7 +285,7 @@ def persons_of(
             first.extend([frame.stamp_ns] * (not first))
             meter(frame, None)
 
-        frames = Clip(end_s=clip.end_s + _COUNTED_S).select(images.frames)
+        frames = Clip(end_s=clip.end_s + COUNTED_S).select(images.frames)
         persons = find_persons(frames, models, config.pose_estimator, on_frame)
     found = [person for each in persons if (person := each.within(clip, first[0])) is not None]
     if not found:

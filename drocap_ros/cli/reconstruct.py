@@ -21,6 +21,7 @@ from drocap_ros.cli.options import (
     image_size,
     rate,
 )
+from drocap_ros.cli.people import add_all_option, people_of, reconstruct_people
 from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
@@ -58,6 +59,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="one motion from several recordings of one person at the same time, by drones, phones or tripods; their"
         " times and places against each other are found",
     )
+    add_all_option(parser, "one motion each")
     add_options(parser)
     add_threads_option(parser)
     add_quiet_option(parser)
@@ -130,6 +132,8 @@ def run(args: argparse.Namespace) -> int:
     if args.together or args.further:
         from drocap_ros.cli.together import run_together
 
+        if args.all:
+            raise InputError("--all: expected one recording, found several; leave out --together, or --all")
         return run_together(args)
     begin = time.perf_counter()
     from drocap_ros.cli.atomic_output import default_folder
@@ -144,8 +148,8 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.recording.keypoints.files import as_tracks_file
 
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
-    names = output_names(args, out, clip)
-    person, rule = parse_subject(args.subject)
+    names, people = output_names(args, out, clip), people_of(args)
+    person, rule = parse_subject(args.subject if people is None else "")
     rule |= {"feet_model": args.feet} if args.feet else {}
     config = load_config(args.config).replace("pose_estimator", **rule)
     if args.dictionary:
@@ -161,6 +165,15 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(
                 f"--topic {args.topic}: expected images, found recorded 2D poses; add --redetect, or leave it out"
             )
+        rate_hz = args.rate if source == args.input else None
+        selection = Selection(
+            clip, person, args.redetect, args.topic, rate_hz, args.evidence, people or (), args.threads
+        )
+        if people is not None:
+            text = reconstruct_people(args, source, out, config, telemetry, selection, progress)
+            if not args.quiet:
+                print(text)
+            return 0
         motion, tracks = reconstruct_input(
             source,
             method=args.method,
@@ -168,15 +181,7 @@ def run(args: argparse.Namespace) -> int:
             models=args.models,
             progress=progress,
             telemetry=telemetry,
-            selection=Selection(
-                clip,
-                person,
-                args.redetect,
-                args.topic,
-                args.rate if source == args.input else None,
-                args.evidence,
-                args.threads,
-            ),
+            selection=selection,
         )
         meta = {**motion.meta, "input": args.input.name, "command": args.command_line}
         motion = dataclasses.replace(motion, meta=meta)

@@ -17,6 +17,7 @@ from drocap_ros.cli.options import (
     add_threads_option,
     clip_of,
 )
+from drocap_ros.cli.people import add_all_option, people_of, save_people_tracks
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--list", action="store_true", help="only find the persons, and write persons.jpg with their numbers"
     )
+    add_all_option(parser, "tracks of each")
     add_clip_options(parser)
     add_network_options(parser)
     add_threads_option(parser)
@@ -69,16 +71,21 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or default_folder(Path(args.video), "tracks")
     check_output_folder(out)
     refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
-    person, rule = parse_subject(args.subject)
+    people = people_of(args)
+    if args.list and people is not None:
+        raise InputError("--list: expected no --all and no --subject beside it, found one; leave it out")
+    person, rule = parse_subject(args.subject if people is None else "")
     rule |= {"feet_model": args.feet} if args.feet else {}
     config = load_config(args.config).replace("pose_estimator", on_loss="wait" if args.wait else "next", **rule)
     folder = models_folder(args.models or config.pose_estimator.models_dir)
     ensure_networks(folder, args.video, args)
-    write = _list if args.list else _track
+    write = _list if args.list else _track if people is None else _track_people
+    selection = Selection(clip_of(args), person, topic=args.topic, people=people or (), threads=args.threads)
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
-        text = write(args, config, folder, Selection(clip_of(args), person, topic=args.topic), target, progress)
+        text = write(args, config, folder, selection, target, progress)
     if not args.quiet:
-        names = "persons.jpg" if args.list else "tracks.npz, overlay.mp4" if args.overlay else "tracks.npz"
+        tracks = "tracks.npz" if people is None else "person_N/tracks.npz"
+        names = "persons.jpg" if args.list else f"{tracks}, overlay.mp4" if args.overlay else tracks
         print(f"{text}\nwritten: {out}/{names}")
     return 0
 
@@ -137,7 +144,7 @@ def _track(
         def on_frame(frame: Frame, observation: PoseObservation) -> None:
             meter(frame, observation)
             if draw is not None:
-                draw(frame, observation)
+                draw(frame, [observation])
 
         frames = selection.clip.select(images.frames)
         observations = observe(frames, estimator, on_frame, begin_ns, args.threads)
@@ -149,6 +156,27 @@ def _track(
     begin = observations[0].stamp_ns
     changes = [f"{(stamp_ns - begin) * 1e-9:.1f} s: {text}" for stamp_ns, text in estimator.tracker.changes]
     return "\n".join([_summary(found, len(observations)), *changes[1:], *_overlay_words(drawn.codec)])
+
+
+def _track_people(
+    args: argparse.Namespace,
+    config: DrocapConfig,
+    models: Path,
+    selection: Selection,
+    target: Path,
+    progress: Progress,
+) -> str:
+    """Write the tracks of everybody, or of the selected people, and the overlay; returns a line for each."""
+    from drocap_ros.open_images import open_images
+    from drocap_ros.people import track_people
+    from drocap_ros.report.overlay import OverlayVideo
+
+    with open_images(args.video, config.image_ingest, args.topic) as images:
+        drawn = OverlayVideo(target / "overlay.mp4", images.rate_hz, with_points=args.points)
+    with drawn if args.overlay else contextlib.nullcontext():
+        found = track_people(args.video, config, models, selection, progress, drawn.add if args.overlay else None)
+    save_people_tracks(target, found.tracks)
+    return "\n".join([*found.words(), *found.left_out, *_overlay_words(drawn.codec)])
 
 
 def _overlay_words(codec: str) -> list[str]:

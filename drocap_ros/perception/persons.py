@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,48 +44,79 @@ class FoundPerson:
         return dataclasses.replace(self, boxes=boxes) if boxes else None
 
 
-def find_persons(
-    frames: Iterable[Frame],
-    models_dir: str | Path,
-    config: PoseEstimatorConfig,
-    on_frame: Callable[[Frame, None], None] | None = None,
-) -> list[FoundPerson]:
-    """Persons of a recording in the order of their appearance, then from left to right; five detections a second.
+class PersonFinder:
+    """Finds the persons of a recording by five detections a second; they are numbered at the end.
 
     A person that leaves the image and returns later counts as another one.
 
     Raises
     ------
     InputError
+        When a model is missing.
+    """
+
+    def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig) -> None:
+        # Without a box of the drone the rule `roi` never chooses a subject: all persons are bystanders.
+        self.estimator = PoseEstimator(models_dir, dataclasses.replace(config, subject="roi", subject_box=""))
+        self._least = config.confirm_frames
+        self._seen: dict[Person, dict[int, np.ndarray]] = {}
+        self._images = 0
+        self._last_ns: int | None = None
+
+    def due(self, stamp_ns: int) -> bool:
+        """Whether the image of this time is one in which persons are sought."""
+        return self._last_ns is None or stamp_ns - self._last_ns >= _EVERY_NS - _JITTER_NS
+
+    def find(self, image: np.ndarray, stamp_ns: int) -> list[Person]:
+        """Those detected in the next image that is due, (H, W, 3) uint8 BGR."""
+        self._last_ns = stamp_ns
+        self.estimator.process(image, stamp_ns)
+        self._images += 1
+        # A track that clutter has taken over is a person's up to there.
+        found = [p for p in self.estimator.tracker.persons if p.detected_ns == stamp_ns]
+        found = [person for person in found if person.mean_score >= _LEAST_SCORE]
+        for person in found:
+            self._seen.setdefault(person, {})[stamp_ns] = person.box
+        return found
+
+    def numbered(self) -> dict[Person, FoundPerson]:
+        """The persons in the order of their appearance, then from left to right.
+
+        Raises
+        ------
+        InputError
+            When no person is found.
+        """
+        least = min(self._least, self._images)
+        found = [(person, boxes) for person, boxes in self._seen.items() if len(boxes) >= least]
+        if not found:
+            raise InputError(
+                f"expected a person in view, found none in {self._images} images; try another video or model"
+            )
+        found.sort(key=lambda entry: (min(entry[1]), float(entry[1][min(entry[1])][0])))
+        return {person: FoundPerson(number, boxes) for number, (person, boxes) in enumerate(found, 1)}
+
+
+def find_persons(
+    frames: Iterable[Frame],
+    models_dir: str | Path,
+    config: PoseEstimatorConfig,
+    on_frame: Callable[[Frame, None], None] | None = None,
+) -> list[FoundPerson]:
+    """Persons of a recording, as :class:`PersonFinder` finds them.
+
+    Raises
+    ------
+    InputError
         When a model is missing, or no person is found.
     """
-    # Without a box of the drone the rule `roi` never chooses a subject: all persons are bystanders.
-    estimator = PoseEstimator(models_dir, dataclasses.replace(config, subject="roi", subject_box=""))
-    seen: dict[Person, dict[int, np.ndarray]] = {}
-    images = 0
-    for frame in _five_a_second(prefetch(frames), on_frame):
-        estimator.process(frame.image, frame.stamp_ns)
-        images += 1
-        for person in estimator.tracker.persons:
-            # A track that clutter has taken over is a person's up to there.
-            if person.detected_ns == frame.stamp_ns and person.mean_score >= _LEAST_SCORE:
-                seen.setdefault(person, {})[frame.stamp_ns] = person.box
-    least = min(config.confirm_frames, images)
-    found = [boxes for boxes in seen.values() if len(boxes) >= least]
-    if not found:
-        raise InputError(f"expected a person in view, found none in {images} images; try another video or model")
-    found.sort(key=lambda boxes: (min(boxes), float(boxes[min(boxes)][0])))
-    return [FoundPerson(number, boxes) for number, boxes in enumerate(found, 1)]
-
-
-def _five_a_second(frames: Iterable[Frame], on_frame: Callable[[Frame, None], None] | None) -> Iterator[Frame]:
-    last_ns: int | None = None
-    for frame in frames:
+    finder = PersonFinder(models_dir, config)
+    for frame in prefetch(frames):
         if on_frame is not None:
             on_frame(frame, None)
-        if last_ns is None or frame.stamp_ns - last_ns >= _EVERY_NS - _JITTER_NS:
-            last_ns = frame.stamp_ns
-            yield frame
+        if finder.due(frame.stamp_ns):
+            finder.find(frame.image, frame.stamp_ns)
+    return list(finder.numbered().values())
 
 
 def in_view(persons: Sequence[Person], stamp_ns: int) -> int:

@@ -24,10 +24,11 @@ def reconstruct_people(
     adjuster: BundleAdjusterConfig | None = None,
     progress: Progress | None = None,
 ) -> dict[int, Motion]:
-    """Motions of persons by their numbers, each from the first to the last image that shows the person.
+    """Motions of persons by their numbers.
 
-    The person whom most images show finds the camera, as :func:`~.reconstruct.reconstruct` does; its path and its
-    metres are those of all.  Their sizes are measured in it.
+    The person whom most images show finds the camera, in all images, as :func:`~.reconstruct.reconstruct` does; its
+    path and its metres are those of all.  The others' sizes are measured in it, and their motions last from the first
+    to the last image that shows them.
 
     people : tracks of the same images by number, with the same camera and fixed points
 
@@ -43,7 +44,7 @@ def reconstruct_people(
     motions: dict[int, Motion] = {}
     for number, tracks in people.items():
         rows = slice(int(seen[number][0]), int(seen[number][-1]) + 1)
-        motion = of_frames(lead, rows) if number == first else _other(tracks.of_frames(rows), camera, lead, settings)
+        motion = lead if number == first else _other(tracks.of_frames(rows), camera, lead, settings)
         motions[number] = dataclasses.replace(motion, meta={**motion.meta, "camera_found_with": first})
     return motions
 
@@ -59,14 +60,3 @@ def _other(tracks: Tracks, camera: SharedCamera | None, lead: Motion, settings: 
     motion, _ = reconstruct_with_camera(tracks, camera=camera, **settings)  # type: ignore[arg-type]
     told: Values = {name: lead.meta[name] for name in ("camera", "telemetry_rejected") if name in lead.meta}
     return dataclasses.replace(motion, meta=motion.meta | told)
-
-
-def of_frames(motion: Motion, rows: slice) -> Motion:
-    """A part of a motion."""
-    frames = len(motion.stamp_ns)
-    arrays = {
-        field.name: value[rows]
-        for field in dataclasses.fields(motion)
-        if isinstance(value := getattr(motion, field.name), np.ndarray) and len(value) == frames
-    }
-    return dataclasses.replace(motion, meta={**motion.meta, "frames": len(arrays["stamp_ns"])}, **arrays)  # type: ignore[arg-type]

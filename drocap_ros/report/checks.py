@@ -132,20 +132,22 @@ class MotionCheck(Enum):
     TELEMETRY_REJECTED = ("Telemetry not used", "{words} The motion stays in the axes of the camera.")
     TELEMETRY_JUMPS = ("Reported position jumps", "{words}")
     CALIBRATION = ("Camera measured", "{words}")
+    LEFT_OUT = ("Left out", "{words}.")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A check that applies; ``values`` fill in its words."""
+    """A check that applies; ``values`` fill in its words; ``person`` : number of one of several."""
 
     check: MotionCheck
     severity: Severity
     values: dict[str, float | str]
+    person: int | None = None
 
     @property
     def title(self) -> str:
         """A few words."""
-        return self.check.value[0]
+        return self.check.value[0] if self.person is None else f"Person {self.person}: {self.check.value[0]}"
 
     @property
     def text(self) -> str:

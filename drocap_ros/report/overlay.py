@@ -103,15 +103,19 @@ class OverlayVideo:
         """H.264 or MPEG-4; empty before the second frame."""
         return self._video.codec if self._video else ""
 
-    def add(self, frame: Frame, observation: PoseObservation) -> None:
-        """Draw a frame and append it."""
+    def add(self, frame: Frame, observations: Sequence[PoseObservation]) -> None:
+        """Draw everybody in a frame and append it."""
         import cv2
 
         height, width = frame.image.shape[:2]
         scale = min(1.0, _VIDEO_PX / max(width, height))
         size = (max(2, round(width * scale) // 2 * 2), max(2, round(height * scale) // 2 * 2))
-        below = frame.image if self._trails is None else self._trails.draw(frame.image, observation)
-        image = cv2.resize(draw(below, observation), size, interpolation=cv2.INTER_AREA)
+        drawn = frame.image
+        if self._trails is not None and observations:
+            drawn = self._trails.draw(drawn, observations[0])
+        for observation in observations:
+            drawn = draw(drawn, observation)
+        image = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
         if self._first is None:
             self._first = frame.stamp_ns, image
         elif self._video is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from html import escape
@@ -14,7 +15,7 @@ import numpy as np
 from drocap_ros.clip import Progress
 from drocap_ros.motion import Motion
 from drocap_ros.report import plots
-from drocap_ros.report.checks import Finding, Severity, run_checks
+from drocap_ros.report.checks import Finding, MotionCheck, Severity, run_checks
 from drocap_ros.report.motion_images import MotionImages, read_motion_images
 from drocap_ros.report.page_data import images_of_page, page_data, script_json
 from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics, scale_of, stage_seconds
@@ -53,32 +54,44 @@ def save_report(
     return images is not None
 
 
-def render_report(motion: Motion, images: MotionImages | None = None, command: str = "") -> str:
-    """HTML of the report; see :func:`save_report`."""
+def render_report(
+    motion: Motion,
+    images: MotionImages | None = None,
+    command: str = "",
+    people: Mapping[int, Motion] | None = None,
+    placed: Mapping[int, Motion] | None = None,
+) -> str:
+    """HTML of the report; see :func:`save_report`.
+
+    people : everybody by number, ``motion`` first, for a page of several; placed : the same on its times
+    """
     s = motion_statistics(motion)
-    findings = run_checks(motion, s)
+    findings = run_checks(motion, s) if people is None else _findings(people)
     folder = files("drocap_ros.report") / "page"
     page = Template((folder / "page.html").read_text(encoding="utf-8"))
     name = str(motion.meta.get("input", "motion"))
     return page.substitute(
         title=escape(name),
-        subtitle=escape(_subtitle(motion)),
+        subtitle=escape(_subtitle(motion, people)),
         style=(folder / "style.css").read_text(encoding="utf-8"),
-        tiles="".join(_tile(*tile) for tile in _tiles(motion, s)),
+        tiles="".join(_tile(*tile) for tile in (_tiles(motion, s) if people is None else _people_tiles(people))),
         badge=_badge(findings),
         checks=_checks(findings),
         plots="".join(_figure(*figure) for figure in _plots(motion, s)),
         provenance=_provenance(motion, command),
         parameters=escape(json.dumps(motion.meta, indent=1, sort_keys=True)),
-        data=script_json(page_data(motion, s, images)),
+        data=script_json(page_data(motion, s, images, placed)),
         script="\n".join((folder / name).read_text(encoding="utf-8") for name in _SCRIPTS),
     )
 
 
-def _subtitle(motion: Motion) -> str:
+def _subtitle(motion: Motion, people: Mapping[int, Motion] | None) -> str:
     method = motion.meta.get("method", "unknown")
     frame = "in the world, z up" if motion.frame == "world" else "as the camera saw it"
-    return f"3D motion of a person, {frame} · method {method}"
+    if people is None:
+        return f"3D motion of a person, {frame} · method {method}"
+    first = next(iter(people))
+    return f"3D motion of {len(people)} persons, {frame} · method {method} · curves and plots: person {first}"
 
 
 def _tile(value: str, unit: str, label: str) -> str:
@@ -96,6 +109,31 @@ def _tiles(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
         (f"{s.view_speed_dps:.0f}", "°/s", f"view of the body, {s.view_span_deg:.0f}° in all"),
         (scale, "", f"scale, {source}"),
     ]
+
+
+def _people_tiles(people: Mapping[int, Motion]) -> list[tuple[str, str, str]]:
+    """One for each person."""
+    tiles = []
+    begin_ns = min(int(motion.stamp_ns[0]) for motion in people.values())
+    for number, motion in sorted(people.items()):
+        s = motion_statistics(motion)
+        seen = np.flatnonzero(s.seen)
+        first, last = ((int(motion.stamp_ns[at]) - begin_ns) * 1e-9 for at in (seen[0], seen[-1]))
+        share = _number(100 * s.median_px / s.body_px, ".1f")
+        label = f"{first:.1f} to {last:.1f} s, median reprojection error {share} % of the body, {scale_of(motion)[1]}"
+        tiles.append((f"person {number}", "", label))
+    return tiles
+
+
+def _findings(people: Mapping[int, Motion]) -> list[Finding]:
+    """The checks of everybody, each with its person, and who was left out."""
+    found = [
+        dataclasses.replace(finding, person=number)
+        for number, motion in people.items()
+        for finding in run_checks(motion, motion_statistics(motion))
+    ]
+    left_out = next(iter(people.values())).meta.get("left_out", [])
+    return found + [Finding(MotionCheck.LEFT_OUT, Severity.NOTE, {"words": words}) for words in left_out]
 
 
 def _number(value: float, form: str) -> str:

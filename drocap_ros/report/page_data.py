@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,13 @@ from drocap_ros.skeleton import side_of
 MAX_POSES = 3000
 
 
-def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dict[str, object]:
+def page_data(
+    motion: Motion, s: Statistics, images: MotionImages | None, people: Mapping[int, Motion] | None = None
+) -> dict[str, object]:
     """JSON-compatible data: integers, row-major, null where unknown.
 
     ``pose`` mm and ``camera`` (right, forward; thousandths) in axes with z up; ``keypoints`` tenths of a px;
+    ``people`` holds poses and keypoints of each of several persons on the same frames, None = there is one;
     ``heading`` milliradians; ``times`` ms; ``movement`` 1 / ``scale`` of its unit, a list per side.
     """
     shown = shown_frames(motion)
@@ -41,6 +45,15 @@ def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dic
         "movement": [_curve(curve) for curve in movement(motion, s, shown)],
         "series": {"error": _numbers(s.error_px[shown]), "view": _numbers(s.view_deg[shown])},
         "image": None if images is None else _images(images, shown),
+        "people": None if people is None else [_person(number, other, shown) for number, other in people.items()],
+    }
+
+
+def _person(number: int, motion: Motion, shown: np.ndarray) -> dict[str, object]:
+    return {
+        "name": str(number),
+        "pose": _integers(upright_joints(motion)[shown], 1000),
+        "keypoints": _integers(motion.keypoints[shown], 10),
     }
 
 

@@ -258,7 +258,7 @@ def test_overlay_has_the_rate_of_the_video_not_of_its_first_two_images(tmp_path)
     cv2 = pytest.importorskip("cv2")
     with OverlayVideo(tmp_path / "overlay.mp4", 20.0) as overlay:
         for stamp in (0, 100_000_000, 150_000_000):
-            overlay.add(Frame(stamp, np.zeros((48, 64, 3), np.uint8)), PoseObservation(stamp, 0, (64, 48)))
+            overlay.add(Frame(stamp, np.zeros((48, 64, 3), np.uint8)), [PoseObservation(stamp, 0, (64, 48))])
     assert cv2.VideoCapture(str(tmp_path / "overlay.mp4")).get(cv2.CAP_PROP_FPS) == pytest.approx(20.0)
 
 

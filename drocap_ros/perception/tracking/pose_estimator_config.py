@@ -103,3 +103,26 @@ def parse_subject(text: str) -> tuple[int | None, dict[str, str]]:
         raise ParameterError(f"subject: expected a person's number, largest, centre or a box, got {text!r}; correct it")
     parse_box(text)
     return None, {"subject": "box", "subject_box": text}
+
+
+#: Four numbers below it are persons, not a box: nobody within so few px is recognised.
+_LEAST_BOX_PX = 30
+
+
+def parse_people(text: str) -> tuple[int, ...]:
+    """Numbers of several persons, as "1,3"; empty for every other choice of :func:`parse_subject`.
+
+    Raises
+    ------
+    ParameterError
+        When a number is 0 or comes twice.
+    """
+    words = text.split(",")
+    if len(words) < 2 or not all(word.strip().isdecimal() for word in words):
+        return ()
+    numbers = tuple(map(int, words))
+    if len(numbers) == 4 and max(numbers) >= _LEAST_BOX_PX:
+        return ()
+    if min(numbers) < 1 or len(set(numbers)) < len(numbers):
+        raise ParameterError(f"subject: expected different numbers of persons, from 1 on, got {text!r}; correct it")
+    return numbers

@@ -15,8 +15,13 @@ const motion = (() => {
     camera: numbers(raw.camera, 1000),
     heading: numbers(raw.heading, 1000),
     keypoints: numbers(raw.keypoints, 10),
+    people: raw.people && raw.people.map((one) => (
+      { ...one, pose: numbers(one.pose, 1000), keypoints: numbers(one.keypoints, 10) })),
   };
 })();
+
+/** Who is drawn: the one person, or everybody. */
+const bodies = motion.people ?? [motion];
 
 const vec = {
   add: (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]],
@@ -27,10 +32,10 @@ const vec = {
 const FOOT = 0.06; // m from the ankle to the floor
 
 const slice3 = (array, at) => [array[at], array[at + 1], array[at + 2]];
-const jointAt = (frame, joint) => slice3(motion.pose, 3 * (frame * motion.joints.length + joint));
-const keypointAt = (frame, joint) => {
+const jointAt = (frame, joint, body = motion) => slice3(body.pose, 3 * (frame * motion.joints.length + joint));
+const keypointAt = (frame, joint, body = motion) => {
   const at = 2 * (frame * motion.joints.length + joint);
-  return [motion.keypoints[at], motion.keypoints[at + 1]];
+  return [body.keypoints[at], body.keypoints[at + 1]];
 };
 const known = (point) => point.every(Number.isFinite);
 
@@ -52,7 +57,7 @@ function meanAround(list, place, half) {
  */
 const floors = (() => {
   const lowest = Array.from({ length: motion.count }, (_, f) => {
-    const heights = motion.joints.map((_, j) => jointAt(f, j)[2]).filter(Number.isFinite);
+    const heights = bodies.flatMap((body) => motion.joints.map((_, j) => jointAt(f, j, body)[2])).filter(Number.isFinite);
     return heights.length ? Math.min(...heights) : NaN;
   });
   const sorted = lowest.filter(Number.isFinite).sort((a, b) => a - b);
@@ -63,9 +68,30 @@ const floors = (() => {
   });
 })();
 
+/** Mean of the roots of all who are there in a frame. */
+function middleOf(frame) {
+  const there = bodies.map((body) => jointAt(frame, motion.root, body)).filter(known);
+  return [0, 1, 2].map((axis) => there.reduce((sum, p) => sum + p[axis], 0) / there.length);
+}
+
+/** How many times as much room as one person everybody takes. */
+const room = (() => {
+  const away = [];
+  if (bodies.length > 1) {
+    for (let f = 0; f < motion.count; f++) {
+      const middle = middleOf(f);
+      const apart = bodies.map((body) => jointAt(f, motion.root, body)).filter(known)
+        .map((p) => Math.hypot(p[0] - middle[0], p[1] - middle[1]));
+      if (apart.length) away.push(Math.max(...apart));
+    }
+  }
+  away.sort((a, b) => a - b);
+  return 1 + (away[Math.floor(away.length * 0.9)] ?? 0) / 1.5;
+})();
+
 /** Target of the views in each frame: the root, smoothed over time, as people climb and a floor may be another's. */
 const targets = (() => {
-  const roots = Array.from({ length: motion.count }, (_, f) => jointAt(f, motion.root));
+  const roots = Array.from({ length: motion.count }, (_, f) => middleOf(f));
   const columns = [0, 1].map((axis) => roots.map((p) => p[axis]));
   const above = roots.map((p, f) => p[2] - floors[f]);
   const height = (meanAround(above, 0, motion.count) || 0.9) - 0.02;

@@ -31,8 +31,8 @@ const images = motion.image && {
 const imageBox = (() => {
   if (images) return images.box;
   let box = [Infinity, Infinity, -Infinity, -Infinity];
-  for (let i = 0; i < motion.keypoints.length; i += 2) {
-    const x = motion.keypoints[i], y = motion.keypoints[i + 1];
+  for (const { keypoints } of bodies) for (let i = 0; i < keypoints.length; i += 2) {
+    const x = keypoints[i], y = keypoints[i + 1];
     if (Number.isFinite(x + y)) box = [Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y)];
   }
   const room = 0.1 * Math.max(box[2] - box[0], box[3] - box[1], 10);
@@ -56,23 +56,27 @@ function drawImagePane(canvas, frame, showKeypoints, colours, redraw) {
   if (!showKeypoints && images) return;
   const place = ([x, y]) => [left + scale * (x - x0), top + scale * (y - y0)];
   const thick = Math.max(2.5, 0.0085 * height);
-  motion.parents.forEach((parent, joint) => {
-    const b = keypointAt(shown, joint), a = parent < 0 ? b : keypointAt(shown, parent);
-    if (known(a) && known(b)) {
-      if (images) line(context, [place(a), place(b)], "rgb(0 0 0 / .45)", thick + 2.5);
-      line(context, [place(a), place(b)], colours[motion.sides[joint]], thick);
-    }
-  });
-  motion.joints.forEach((_, joint) => {
-    const point = keypointAt(shown, joint);
-    if (!known(point)) return;
-    const [x, y] = place(point);
-    context.fillStyle = "#fff";
-    context.strokeStyle = colours[motion.sides[joint]];
-    context.lineWidth = 1.5;
-    context.beginPath();
-    context.arc(x, y, thick * 0.75, 0, 2 * Math.PI);
-    context.fill();
-    context.stroke();
-  });
+  for (const body of bodies) {
+    motion.parents.forEach((parent, joint) => {
+      const b = keypointAt(shown, joint, body), a = parent < 0 ? b : keypointAt(shown, parent, body);
+      if (known(a) && known(b)) {
+        if (images) line(context, [place(a), place(b)], "rgb(0 0 0 / .45)", thick + 2.5);
+        line(context, [place(a), place(b)], colours[motion.sides[joint]], thick);
+      }
+    });
+    motion.joints.forEach((_, joint) => {
+      const point = keypointAt(shown, joint, body);
+      if (!known(point)) return;
+      const [x, y] = place(point);
+      context.fillStyle = "#fff";
+      context.strokeStyle = colours[motion.sides[joint]];
+      context.lineWidth = 1.5;
+      context.beginPath();
+      context.arc(x, y, thick * 0.75, 0, 2 * Math.PI);
+      context.fill();
+      context.stroke();
+    });
+    const head = keypointAt(shown, motion.joints.indexOf("head"), body);
+    if (body.name && known(head)) named(context, body.name, place(head)[0], place(head)[1] - 3 * thick, "#fff");
+  }
 }

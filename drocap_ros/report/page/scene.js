@@ -43,11 +43,11 @@ function projector(width, height, view, target) {
   const towards = [Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)];
   const right = [-Math.sin(a), Math.cos(a), 0];
   const up = vec.cross(towards, right);
-  const scale = Math.min(height / 2 / (view.reachUp ?? 1.12), width / 2 / (view.reachSide ?? 0.8)) * (view.zoom ?? 1);
+  const scale = Math.min(height / 2 / (view.reachUp ?? 1.12), width / 2 / (view.reachSide ?? 0.8)) * (view.zoom ?? 1) / room;
   return (point) => {
     const d = vec.add(point, target, -1);
     const near = vec.dot(d, towards);
-    const s = (scale * DISTANCE) / Math.max(DISTANCE - near, 0.5);
+    const s = (scale * DISTANCE * room) / Math.max(DISTANCE * room - near, 0.5);
     return [width / 2 + s * vec.dot(d, right), height / 2 - s * vec.dot(d, up), near, s];
   };
 }
@@ -61,7 +61,7 @@ function line(context, points, colour, width) {
 }
 
 function drawFloor(context, project, floor, target, colours) {
-  const reach = 1.4, step = 0.5;
+  const reach = 1.4 * room, step = 0.5;
   for (const axis of [0, 1]) {
     const other = 1 - axis;
     for (let k = Math.ceil((target[axis] - reach) / step); k * step < target[axis] + reach; k++) {
@@ -77,14 +77,14 @@ function drawFloor(context, project, floor, target, colours) {
   }
 }
 
-function drawShadow(context, project, frame, colours) {
+function drawShadow(context, project, frame, colours, body) {
   context.save();
   context.globalAlpha = 0.13;
   context.strokeStyle = colours.text;
   context.beginPath();
   motion.parents.forEach((parent, joint) => {
     if (parent < 0) return;
-    const ends = [jointAt(frame, parent), jointAt(frame, joint)];
+    const ends = [jointAt(frame, parent, body), jointAt(frame, joint, body)];
     if (!ends.every(known)) return;
     const [a, b] = ends.map(([x, y]) => project([x, y, floors[frame]]));
     context.lineWidth = 0.07 * a[3];
@@ -95,11 +95,19 @@ function drawShadow(context, project, frame, colours) {
   context.restore();
 }
 
+/** A person's number above a place. */
+function named(context, name, x, y, colour) {
+  context.fillStyle = colour;
+  context.font = "600 13px system-ui, sans-serif";
+  context.textAlign = "center";
+  context.fillText(name, x, y);
+}
+
 /** The body's parts in one frame, each with its nearness and its drawing function. */
-function bodyParts(context, project, frame, colours) {
+function bodyParts(context, project, frame, colours, body) {
   const parts = [];
   const places = motion.joints.map((_, joint) => {
-    const point = jointAt(frame, joint);
+    const point = jointAt(frame, joint, body);
     return known(point) ? project(point) : null;
   });
   const shade = (side, near) => mixed(colours[side], colours.ground, Math.min(0.45, Math.max(0, 0.14 - near * 0.42)));
@@ -142,6 +150,7 @@ function bodyParts(context, project, frame, colours) {
           context.arc(b[0], b[1], 0.1 * b[3], 0, 2 * Math.PI);
           context.fill();
           context.stroke();
+          if (body.name) named(context, body.name, b[0], b[1] - 0.16 * b[3], colours.text);
         },
       });
     }
@@ -151,7 +160,7 @@ function bodyParts(context, project, frame, colours) {
 
 /** The camera as a square pyramid, its path as a line, as seen from the subject. */
 function cameraParts(context, project, frame, target, colours) {
-  const at = (f) => vec.add(target, slice3(motion.camera, 6 * f + 3), -CAMERA_RADIUS);
+  const at = (f) => vec.add(target, slice3(motion.camera, 6 * f + 3), -CAMERA_RADIUS * room);
   const { right, forward, down } = cameraAxes(frame);
   const apex = at(frame);
   const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) =>
@@ -186,8 +195,8 @@ function drawScene(canvas, frame, view, colours) {
   const target = targets[frame];
   const project = projector(width, height, view, target);
   drawFloor(context, project, floors[frame], target, colours);
-  drawShadow(context, project, frame, colours);
-  const parts = bodyParts(context, project, frame, colours);
+  for (const body of bodies) drawShadow(context, project, frame, colours, body);
+  const parts = bodies.flatMap((body) => bodyParts(context, project, frame, colours, body));
   if (view.showCamera) parts.push(...cameraParts(context, project, frame, target, colours));
   parts.sort((a, b) => a.near - b.near);
   parts.forEach((part) => part.draw());

@@ -1,0 +1,199 @@
+"""Whose joints are these: the keypoints of overlapping persons, each given to one body or to none.
+
+Networks that see one box give the joints of whoever is in front.  A joint is where its body's motion lets it be, a limb
+is no longer than that of the body, and two bodies have no joint in common: what that leaves open is dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from drocap_ros.perception.tracking.body_track import BodyTrack
+from drocap_ros.perception.tracking.limb_colours import difference
+from drocap_ros.skeleton import BODY_15
+
+_SEEN = 0.3  # least confidence of a joint that counts
+_SAME = 0.05  # distance of one joint in two poses, lengths
+_FAR = 3.0  # standard deviations from which a joint's place says no more
+_DROP = 4.5  # cost of a joint that is given to nobody: at three deviations,
+_DROP_BODY = 3.0  # and mean cost of a pose that is nobody's
+_FOREIGN = 1.0  # cost of a joint that the pose of another's box gave
+_OTHER_LOOK = 1.5  # deviations of a limb's colour from which it may be another body's
+_CLEARLY = 2.0  # times as far from the own body as from the other, from which a joint is the other's
+#: Longest limbs over the length of a standing body, a third more than of most: (joint, its parent) by names.
+_LONGEST = {"knee": 0.36, "ankle": 0.36, "elbow": 0.27, "wrist": 0.24, "shoulder": 0.2, "hip": 0.16, "head": 0.26}
+
+
+class Poses(NamedTuple):
+    """Poses of N boxes in one image: (N, P, 2) px, (N, P), and colours of the limbs (N, P, 3)."""
+
+    xy: np.ndarray
+    confidence: np.ndarray
+    colours: np.ndarray
+
+
+class Owned(NamedTuple):
+    """Which pose each of N bodies has, -1 = none; and of which pose each joint (N, P) is, -1 = of none."""
+
+    pose: np.ndarray
+    joint: np.ndarray
+
+
+def own_joints(tracks: Sequence[BodyTrack], poses: Poses) -> Owned:
+    """The joints of overlapping bodies, of the poses in the boxes where each was expected."""
+    body = _bodies(tracks, poses)
+    count = len(BODY_15)
+    joint = np.repeat(body[:, None], poses.xy.shape[1], axis=1)
+    for j in range(poses.xy.shape[1]):
+        joint[:, j] = _joint(tracks, poses, body, j)
+    for k, track in enumerate(tracks):
+        others = [t for t in tracks if t is not track]
+        xy = _of(poses, joint[k])
+        colours = poses.colours[np.maximum(joint[k], 0), np.arange(len(joint[k]))]
+        mixed = _mixed(track, others, xy[:count]) | _of_others_colour(track, others, xy[:count], colours[:count])
+        joint[k, :count] = np.where(mixed, -1, joint[k, :count])
+        joint[k] = np.where(_too_long(track, _of(poses, joint[k])), -1, joint[k])
+    return Owned(body, joint)
+
+
+def _of(poses: Poses, joint: np.ndarray) -> np.ndarray:
+    """(P, 2) px of the joints that poses (P,) give, NaN for -1."""
+    xy: np.ndarray = poses.xy[np.maximum(joint, 0), np.arange(len(joint))].copy()
+    xy[joint < 0] = np.nan
+    return xy
+
+
+def _look(track: BodyTrack, colours: np.ndarray) -> np.ndarray:
+    """(P,) how unlikely colours (P, 3) are on the body's limbs."""
+    off = np.nan_to_num(difference(colours, track.colours), nan=1.0)
+    return np.asarray(0.5 * np.minimum(off, _FAR) ** 2)
+
+
+def _cost(track: BodyTrack, xy: np.ndarray) -> np.ndarray:
+    """(..., P) how unlikely places (..., P, 2) px are of the body's joints: of a Gauss about the expected ones."""
+    reach = track.reach
+    off = np.linalg.norm(xy - track.xy, axis=-1) / reach
+    return np.asarray(0.5 * np.minimum(off, _FAR) ** 2 + 2.0 * np.log(reach / reach.min()) * 0.25)
+
+
+def _bodies(tracks: Sequence[BodyTrack], poses: Poses) -> np.ndarray:
+    """(N,) index of the pose of each body, -1 = none: two boxes may have given the same body."""
+    count = len(BODY_15)
+    cost = np.full((len(tracks), 2 * len(tracks)), _DROP_BODY)
+    for i in range(len(tracks)):
+        seen = poses.confidence[i, :count] >= _SEEN
+        if seen.sum() < 4 or _given_before(tracks, poses, i):
+            cost[:, i] = 2 * _DROP_BODY
+            continue
+        for k, track in enumerate(tracks):
+            exchanged = _cost(track, poses.xy[i][_exchanged(track)])
+            each = np.minimum(_cost(track, poses.xy[i]), exchanged)
+            cost[k, i] = float((each + _look(track, poses.colours[i]))[:count][seen].mean()) + _age_cost(track)
+    rows, columns = linear_sum_assignment(cost)
+    found = np.full(len(tracks), -1)
+    found[rows] = np.where(columns < len(tracks), columns, -1)
+    return found
+
+
+def _exchanged(track: BodyTrack) -> np.ndarray:
+    return track.joint_set.mirror
+
+
+def _age_cost(track: BodyTrack) -> float:
+    """A body unseen for long has no claim on what another one explains as well."""
+    return min((track.stamp_ns - track.seen_ns) * 1e-9, 1.0)
+
+
+def _given_before(tracks: Sequence[BodyTrack], poses: Poses, i: int) -> bool:
+    """Whether another box gave the same body with more confidence."""
+    count = len(BODY_15)
+    for other in range(len(tracks)):
+        if other == i:
+            continue
+        seen = np.minimum(poses.confidence[i], poses.confidence[other])[:count] >= _SEEN
+        if seen.sum() < 4:
+            continue
+        apart = np.linalg.norm(poses.xy[i] - poses.xy[other], axis=1)[:count][seen]
+        better = float(poses.confidence[other, :count].mean()), -other
+        if np.median(apart) < _SAME * tracks[i].length and better > (float(poses.confidence[i, :count].mean()), -i):
+            return True
+    return False
+
+
+def _joint(tracks: Sequence[BodyTrack], poses: Poses, body: np.ndarray, j: int) -> np.ndarray:
+    """(N,) index of the pose whose joint ``j`` is each body's, -1 = none."""
+    count = len(tracks)
+    found = np.where(body >= 0, body, -1)
+    given = [i for i in range(count) if poses.confidence[i, j] >= _SEEN and i in body]
+    claims = [k for k in range(count) if body[k] >= 0]
+    if len(claims) < 1 or not given:
+        return np.where(np.isin(found, given), found, -1)
+    cost = np.full((len(claims), len(given) + len(claims)), _DROP)
+    for row, k in enumerate(claims):
+        for column, i in enumerate(given):
+            own = float(_cost(tracks[k], poses.xy[i])[j] + 0.5 * _look(tracks[k], poses.colours[i])[j])
+            cost[row, column] = own + (0.0 if body[k] == i else _FOREIGN)
+    rows, columns = linear_sum_assignment(cost)
+    result = np.full(count, -1)
+    for row, column in zip(rows, columns, strict=True):
+        if column < len(given):
+            result[claims[row]] = given[column]
+    return _once(tracks, poses, result, j)
+
+
+def _once(tracks: Sequence[BodyTrack], poses: Poses, result: np.ndarray, j: int) -> np.ndarray:
+    """The same where two bodies claim one place: it is the nearer one's, and nobody's where neither is so clearly."""
+    for a in range(len(tracks)):
+        for b in range(a + 1, len(tracks)):
+            if result[a] < 0 or result[b] < 0:
+                continue
+            near = _SAME * max(tracks[a].length, tracks[b].length)
+            places = poses.xy[result[a], j], poses.xy[result[b], j]
+            if np.linalg.norm(places[0] - places[1]) > near or np.linalg.norm(tracks[a].xy[j] - tracks[b].xy[j]) < near:
+                continue
+            off = [np.linalg.norm(places[n] - tracks[k].xy[j]) / tracks[k].reach[j] for n, k in enumerate((a, b))]
+            if off[0] * _CLEARLY > off[1]:
+                result[b] = -1
+            if off[1] * _CLEARLY > off[0]:
+                result[a] = -1
+    return result
+
+
+def _mixed(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndarray) -> np.ndarray:
+    """(15,) bool: joints (15, 2) px far from where they are expected, and where another body's joint of the kind is."""
+    count = len(xy)
+    own = np.linalg.norm(xy - track.xy[:count], axis=1) / track.reach[:count]
+    mixed = np.zeros(count, bool)
+    for other in others:
+        reach = other.reach[:count]
+        same = np.linalg.norm(xy - other.xy[:count], axis=1) / reach
+        mirror = np.linalg.norm(xy - other.xy[BODY_15.mirror], axis=1) / reach[BODY_15.mirror]
+        theirs = np.minimum(same, mirror)
+        mixed |= (own > 1.5) & (theirs * _CLEARLY < own) & (theirs < _FAR)
+    return mixed
+
+
+def _of_others_colour(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """(15,) bool: joints (15, 2) px at the end of limbs whose colours (15, 3) are another body's, where it may be."""
+    count = len(xy)
+    own = np.nan_to_num(difference(colours, track.colours[:count]))
+    found = np.zeros(count, bool)
+    for other in others:
+        for side in (np.arange(count), BODY_15.mirror):
+            theirs = np.nan_to_num(difference(colours, other.colours[side]), nan=np.inf)
+            near = np.linalg.norm(xy - other.xy[side], axis=1) < _FAR * other.reach[side]
+            found |= near & (own > _OTHER_LOOK) & (theirs * _CLEARLY < own)
+    return found
+
+
+def _too_long(track: BodyTrack, xy: np.ndarray) -> np.ndarray:
+    """(P,) bool: joints (P, 2) px at the end of a limb longer than a body's."""
+    joints = track.joint_set
+    parents = np.array(joints.parents)
+    length = np.linalg.norm(xy - xy[np.maximum(parents, 0)], axis=1) / track.length
+    longest = np.array([_LONGEST.get(name.lstrip("lr"), np.inf) for name in joints.joints])
+    return np.asarray((parents >= 0) & (length > longest))

@@ -1,0 +1,115 @@
+"""``--all`` and ``--subject 1,3``: everybody in a video, through the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from people_scenes import SIZE, PeopleScene, camera_of, images_of, of_another, people_of
+
+from drocap_ros.cli import main
+from drocap_ros.motion import load_motion
+from drocap_ros.tracks import load_tracks
+
+pytest.importorskip("onnxruntime")
+
+SCENE = PeopleScene("walk", 1, duration_s=2.4, rate_hz=12.5, distance_m=7.0, orbit=False)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three who walk before a still camera, on ground with stones: what is rendered has hardly any texture."""
+    path = tmp_path_factory.mktemp("people") / "three.avi"
+    people = people_of(SCENE)
+    ground = next(images_of(SCENE, people, ())).image
+    rng = np.random.default_rng(1)
+    stones = ground.copy()
+    for x, y in rng.integers((0, 0), SIZE, (400, 2)).tolist():
+        cv2.circle(stones, (x, y), 4, (0.8 * ground[y, x]).tolist(), -1)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), SCENE.rate_hz, (640, 360))
+    for frame in images_of(SCENE, people):
+        bare = (frame.image == ground).all(axis=2, keepdims=True)
+        image = np.where(bare, stones, frame.image)
+        writer.write(cv2.resize(image, (640, 360), interpolation=cv2.INTER_AREA))
+    writer.release()
+    return path
+
+
+@pytest.fixture(scope="module")
+def out(video: Path) -> Path:
+    folder = video.parent / "out"
+    assert main(["reconstruct", str(video), "--all", "--models", "simulation", "--out", str(folder), "--quiet"]) == 0
+    return folder
+
+
+def test_everybody_has_a_motion_in_one_world(out: Path) -> None:
+    motions = {n: load_motion(out / f"person_{n}" / "motion.npz") for n in (1, 2, 3)}
+    lead = motions[motions[1].meta["camera_found_with"]]
+    places = dict(zip(lead.stamp_ns.tolist(), lead.camera_position, strict=True))
+    for number, motion in motions.items():
+        assert motion.frame == "world"
+        assert motion.meta["person"] == number
+        assert motion.meta["people"] == [1, 2, 3]
+        for ns, place in zip(motion.stamp_ns.tolist(), motion.camera_position, strict=True):
+            np.testing.assert_array_equal(place, places[ns])
+    common = sorted(set.intersection(*(set(motion.stamp_ns.tolist()) for motion in motions.values())))
+    pelvis = [motion.joints3d[np.searchsorted(motion.stamp_ns, common), 0] for motion in motions.values()]
+    frames = np.searchsorted(lead.stamp_ns, common)
+    true = [joints[frames, 0] for joints in people_of(SCENE)]
+    # A still camera's up is that of bodies, to 5 degrees: test/reconstruction/test_people.py has exact ones.
+    np.testing.assert_allclose(distances(pelvis), distances(true), rtol=0.5)
+
+
+def distances(places: list[np.ndarray]) -> list[float]:
+    """m, medians of the distances between three paths (F, 3), sorted."""
+    pairs = ((0, 1), (0, 2), (1, 2))
+    return sorted(float(np.median(np.linalg.norm(places[a] - places[b], axis=1))) for a, b in pairs)
+
+
+def test_joints_of_one_never_go_to_another(out: Path) -> None:
+    truth = [0.5 * camera_of(SCENE).pixels(joints) for joints in people_of(SCENE)]
+    owners = set()
+    for number in (1, 2, 3):
+        keypoints = load_tracks(out / f"person_{number}" / "tracks.npz").keypoints[:, :15]
+        off = [float(np.nanmedian(np.linalg.norm(keypoints - person, axis=2))) for person in truth]
+        who = int(np.argmin(off))
+        owners.add(who)
+        assert off[who] < 6.0
+        assert of_another(keypoints, truth, who).any(axis=1).mean() < 0.05
+    assert len(owners) == 3
+
+
+def test_report_holds_everybody(out: Path) -> None:
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "3D motion of 3 persons" in page
+    assert '"people":[{"name":"1"' in page
+
+
+def test_two_of_three_are_the_same_persons(video: Path, out: Path, tmp_path: Path) -> None:
+    words = ["track", str(video), "--subject", "1,3", "--models", "simulation", "--out", str(tmp_path), "--quiet"]
+    assert main(words) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["person_1", "person_3"]
+    for name in ("person_1", "person_3"):
+        now, before = (load_tracks(folder / name / "tracks.npz") for folder in (tmp_path, out))
+        np.testing.assert_array_equal(now.keypoints, before.keypoints)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--subject", "1,7"], "--subject 7: expected one of 1, 2, 3"),
+        (["--subject", "2,2"], "expected different numbers"),
+        (["--all", "--subject", "2"], "--all: expected no --subject"),
+        (["--all", "--end", "0.5"], "expected a person seen for 1 s"),
+        (["--all", "--method", "live"], "--method live"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(
+    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], expected: str
+) -> None:
+    command = ["reconstruct", str(video), "--models", "simulation", "--out", str(tmp_path / "out"), *words]
+    assert main(command) == 2
+    assert expected in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

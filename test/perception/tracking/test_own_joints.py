@@ -1,0 +1,96 @@
+"""Joints of overlapping bodies: each goes to one body or to none."""
+
+from __future__ import annotations
+
+import numpy as np
+from people_scenes import PeopleScene, camera_of, people_of
+
+from drocap_ros.perception.pose.body_pose import BodyPose
+from drocap_ros.perception.pose.pose_model import NetworkKeypoints
+from drocap_ros.perception.tracking.body_track import BodyTrack
+from drocap_ros.perception.tracking.contested import contested
+from drocap_ros.perception.tracking.own_joints import Poses, own_joints
+from drocap_ros.perception.tracking.person import Person
+from drocap_ros.skeleton import BODY_15
+
+SCENE = PeopleScene("cross", 1)
+TIMES = 10**9 + np.round(SCENE.times * 1e9).astype(np.int64)
+TRUTH = [camera_of(SCENE).pixels(joints) for joints in people_of(SCENE)]
+GREY = np.full((15, 3), 128.0)
+
+
+def pose_of(xy: np.ndarray) -> BodyPose:
+    network = NetworkKeypoints("body15", xy, np.ones(15), np.zeros((15, 3)), np.zeros(15), 100.0)
+    return BodyPose(xy.astype(float), np.ones((15, 3)), np.full(15, 0.95), network)
+
+
+def tracks_up_to(frame: int, who: tuple[int, ...]) -> list[BodyTrack]:
+    """Tracks that have seen every image before ``frame`` and expect the joints in it."""
+    found = []
+    for k in who:
+        xy = TRUTH[k]
+        box = np.concatenate([xy[0].min(axis=0), xy[0].max(axis=0)])
+        track = BodyTrack(Person(box, 0.8, int(TIMES[0]), None), pose_of(xy[0]), BODY_15, int(TIMES[0]))
+        for i in range(1, frame):
+            track.predict(int(TIMES[i]))
+            track.accept(xy[i], np.ones(15, bool), believed=True)
+        track.predict(int(TIMES[frame]))
+        found.append(track)
+    return found
+
+
+def nearest(a: int, b: int) -> int:
+    """Frame in which two persons' pelvises are nearest in the image."""
+    return int(np.linalg.norm(TRUTH[a][:, 0] - TRUTH[b][:, 0], axis=1)[5:].argmin()) + 5
+
+
+def poses(*xy: np.ndarray) -> Poses:
+    return Poses(np.array(xy), np.full((len(xy), 15), 0.95), np.tile(GREY, (len(xy), 1, 1)))
+
+
+def test_own_poses_stay_with_their_bodies_where_two_cross() -> None:
+    frame = nearest(0, 1)
+    owned = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[0][frame], TRUTH[1][frame]))
+    assert owned.pose.tolist() == [0, 1]
+    assert (owned.joint[0] >= 0).mean() > 0.8
+    assert not (owned.joint[0] == 1).any() or not (owned.joint[1] == 0).any()
+
+
+def test_poses_that_the_boxes_exchanged_go_back() -> None:
+    frame = nearest(0, 1) - 4
+    owned = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[1][frame], TRUTH[0][frame]))
+    assert owned.pose.tolist() == [1, 0]
+
+
+def test_one_body_in_both_boxes_is_that_of_whom_it_fits() -> None:
+    frame = nearest(0, 1) - 4
+    for front in (0, 1):
+        twice = poses(TRUTH[front][frame], TRUTH[front][frame] + 0.5)
+        owned = own_joints(tracks_up_to(frame, (0, 1)), twice)
+        assert owned.pose[front] >= 0
+        assert owned.pose[1 - front] == -1
+        assert (owned.joint[1 - front] == -1).all()
+
+
+def test_wrist_on_another_body_is_dropped() -> None:
+    frame = nearest(0, 1) - 6
+    wrist = BODY_15.index("lwrist")
+    borrowed = TRUTH[0][frame].copy()
+    borrowed[wrist] = TRUTH[1][frame, wrist]
+    owned = own_joints(tracks_up_to(frame, (0, 1)), poses(borrowed, TRUTH[1][frame]))
+    assert owned.joint[0, wrist] == -1
+    assert owned.joint[1, wrist] == 1
+    assert (np.delete(owned.joint[0], wrist) >= 0).sum() >= 12
+
+
+def test_images_before_and_after_show_a_borrowed_joint() -> None:
+    frame = nearest(0, 1)
+    ankle = BODY_15.index("rankle")
+    seen = [xy.copy() for xy in TRUTH[:2]]
+    far = frame - 8  # the bodies are apart, the joint is not
+    seen[0][far, ankle] = seen[1][far, ankle]
+    length = [np.full(len(TIMES), 200.0)] * 2
+    found = contested(seen, TIMES, length)
+    assert found[0][far, ankle]
+    assert not found[1][far, ankle]
+    assert found[0].mean() < 0.02
