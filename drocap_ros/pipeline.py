@@ -135,8 +135,7 @@ def _with_own_camera(
 
 def with_origin(motion: Motion, path: Path, tracks: Tracks, origin: Values, seconds: float) -> Motion:
     """A motion whose ``meta`` says what it was made from; ``seconds`` : of reading the input."""
-    images = {"images": {"size": list(tracks.image_size)}}
-    meta = {**motion.meta, "input": path.name, **images, **origin}
+    meta = {**motion.meta, "input": path.name, "images": {"size": list(tracks.image_size)}, **origin}
     stages = {"pose2d": seconds, **meta.get("seconds", {})}
     meta["seconds"] = {**stages, "total": seconds + stages.get("total", 0.0)}
     return dataclasses.replace(motion, meta=meta)
