@@ -64,7 +64,10 @@ class SubjectChoice:
         waits = self._config.on_loss == "wait"
         if last is None:
             return self._config.subject in ("box", "roi") and (first or waits)
-        return waits or last.unconfirmed_s(stamp_ns) <= (0.0 if last.left_image else coast_s + _GIVE_UP_S)
+        # Whoever was followed for a moment is not waited for much longer.
+        followed_s = (last.confirmed_ns - last.first_ns) * 1e-9
+        longest_s = 0.0 if last.left_image else coast_s + min(_GIVE_UP_S, followed_s)
+        return waits or last.unconfirmed_s(stamp_ns) <= longest_s
 
     def _confirmed(self, person: Person, first: bool) -> bool:
         """Whether enough images show the person; at the beginning a certain detection is enough."""

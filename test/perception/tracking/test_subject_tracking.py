@@ -252,6 +252,16 @@ def test_next_person_after_the_subject_left_has_a_new_track_id():
     assert newcomers[-1].track_id == 2
 
 
+@pytest.mark.parametrize(("shown", "waited"), [(10, False), (100, True)], ids=["a moment", "seconds"])
+def test_a_subject_is_waited_for_as_long_as_it_was_followed_at_most(shown, waited):
+    """Half a second, or more than it takes to give up; another one stands by: first it is seen, then it is chosen."""
+    scene, bystander = Scene(on_loss="next"), (150, 180, 140, BLUE)
+    for _ in range(shown):
+        scene.show([(400, 180, 160, RED), bystander])
+    after = [scene.show([bystander]) for _ in range(60)]
+    assert (after[-1] is None) == waited
+
+
 def leaves(colours, back):
     """The subject in red walks out at the right, another one stands; someone in ``colours`` comes ``back`` at x."""
     scene = Scene(on_loss="next")
