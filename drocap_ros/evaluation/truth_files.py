@@ -110,7 +110,9 @@ def _on_the_body(path: Path, points: _Points) -> tuple[np.ndarray, np.ndarray]:
         there = ", ".join(re.sub(r"[^ -~]", "?", name)[:30] for name in points.names[:20]) or "none"
         raise InputError(f"expected joints by names, found no {', '.join(missing)} among {there}; rename the joints")
     x = in_body_order(points.positions[:, list(found.values())].astype(np.float64), list(found), LIMB_JOINTS)
-    x[~np.isfinite(x).all(axis=2)] = np.nan
+    lost = (x == 0.0).all(axis=2)  # some programs write a lost point as the origin
+    lost[:, [i for i in range(len(BODY_17)) if i not in _LIMBS]] = False
+    x[lost | ~np.isfinite(x).all(axis=2)] = np.nan
     whole = x[np.isfinite(x[:, _LIMBS]).all(axis=(1, 2))]
     if not len(whole):
         raise InputError("expected every limb joint in some frame, found none; fill the gaps in")

@@ -131,9 +131,10 @@ def test_units_and_vertical_fit_the_body_or_are_corrected_in_a_line(tmp_path, wo
     assert said in caplog.text
 
 
-def test_frames_in_gaps_of_the_truth_are_left_out(tmp_path, world, caplog, capsys):
+@pytest.mark.parametrize("lost", [np.nan, 0.0])
+def test_frames_in_gaps_of_the_truth_are_left_out(tmp_path, world, caplog, capsys, lost):
     x = world.joints3d[:, :15].copy()
-    x[10:15, 3] = np.nan
+    x[10:15, 3] = lost
     path = trc(tmp_path / "truth.trc", list(BODY_15.joints), x)
     assert main(["evaluate", "compare", str(tmp_path), str(path)]) == 0
     assert "gaps of the truth: left out" in caplog.text
