@@ -82,6 +82,7 @@ bench: setup  ## benchmarks (about an hour); each writes its page of docs/figure
 	$(BENCHMARK)/accuracy.py
 	$(BENCHMARK)/reconstruction.py
 	$(BENCHMARK)/perception.py
+	$(BENCHMARK)/peers.py
 	$(BENCHMARK)/recording.py --seconds 120 --flight 60
 	$(BENCHMARK)/live.py
 

@@ -66,7 +66,7 @@ def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int], udp: bool = F
     place = maps.reshape(len(maps), -1).argmax(axis=1)
     top = np.stack([place % columns, place // columns], -1)
     score = maps[np.arange(len(maps)), top[:, 1], top[:, 0]]
-    xy = _newton_step(_blur(np.maximum(maps, 0.0)), top)
+    xy = _newton_step(maps, top)
     # Training draws the peak of a joint at pixel x at cell x / stride, not at the cell's middle.
     scale = np.array([stride[0] ** 2, stride[0] * stride[1], stride[1] ** 2], np.float32)
     return Peaks(xy * stride, score, _moments(maps, top, xy) * scale, _second_peak(maps, top, score))
@@ -74,30 +74,29 @@ def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int], udp: bool = F
 
 def _second_peak(maps: np.ndarray, top: np.ndarray, score: np.ndarray) -> np.ndarray:
     """(P,) height of the highest local maximum beside the top cell; 0 where there is none."""
+    j, y, x = np.nonzero(maps > _LEAST_SECOND * score[:, None, None])
     padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    across = np.maximum(np.maximum(padded[:, :, :-2], padded[:, :, 1:-1]), padded[:, :, 2:])
-    highest = np.maximum(np.maximum(across[:, :-2], across[:, 1:-1]), across[:, 2:])
-    peak = (maps >= highest) & (maps > _LEAST_SECOND * score[:, None, None])
-    peak[np.arange(len(maps)), top[:, 1], top[:, 0]] = False
-    second: np.ndarray = np.where(peak, maps, 0.0).max(axis=(1, 2)).astype(np.float32)
+    around = np.stack([padded[j, y + dy, x + dx] for dy in range(3) for dx in range(3)])
+    peak = (around[4] >= around.max(axis=0)) & ((y != top[j, 1]) | (x != top[j, 0]))
+    second = np.zeros(len(maps), np.float32)
+    np.maximum.at(second, j[peak], around[4][peak])
     return second
 
 
-def _blur(maps: np.ndarray) -> np.ndarray:
-    """3-tap binomial smoothing along both axes, the border repeated."""
-    p = np.pad(maps, ((0, 0), (1, 1), (0, 0)), mode="edge")
-    down = 0.25 * p[:, :-2] + 0.5 * p[:, 1:-1] + 0.25 * p[:, 2:]
-    p = np.pad(down, ((0, 0), (0, 0), (1, 1)), mode="edge")
-    return 0.25 * p[:, :, :-2] + 0.5 * p[:, :, 1:-1] + 0.25 * p[:, :, 2:]
+def _newton_step(maps: np.ndarray, peak: np.ndarray) -> np.ndarray:
+    """(P, 2) float32 cells: one Newton step on the logarithm from the highest cell, at most one cell long.
 
-
-def _newton_step(smooth: np.ndarray, peak: np.ndarray) -> np.ndarray:
-    """(P, 2) float32 cells: one Newton step on the logarithm from the highest cell, at most one cell long."""
-    joints, rows, columns = smooth.shape
+    Around it the maps are smoothed by three binomial weights along both axes, their border repeated.
+    """
+    joints, rows, columns = maps.shape
     x = np.clip(peak[:, 0], 1, columns - 2)
     y = np.clip(peak[:, 1], 1, rows - 2)
     j = np.arange(joints)[:, None, None]
-    patch = smooth[j, (y[:, None] + [-1, 0, 1])[:, :, None], (x[:, None] + [-1, 0, 1])[:, None, :]]
+    five = np.arange(-2, 3)
+    down, across = np.clip(y[:, None] + five, 0, rows - 1), np.clip(x[:, None] + five, 0, columns - 1)
+    patch = np.maximum(maps[j, down[:, :, None], across[:, None, :]], 0.0)
+    patch = 0.25 * patch[:, :-2] + 0.5 * patch[:, 1:-1] + 0.25 * patch[:, 2:]
+    patch = 0.25 * patch[:, :, :-2] + 0.5 * patch[:, :, 1:-1] + 0.25 * patch[:, :, 2:]
     f = np.log(np.maximum(patch, 1e-10))
     gx, gy = (f[:, 1, 2] - f[:, 1, 0]) / 2, (f[:, 2, 1] - f[:, 0, 1]) / 2
     hxx = f[:, 1, 2] - 2 * f[:, 1, 1] + f[:, 1, 0]

@@ -1,14 +1,15 @@
-"""Cholesky factors of symmetric bands, and triangular solves of many right sides in pieces that the cache holds."""
+"""Cholesky factors of symmetric bands, and triangular solves of many right sides by the blocks of a wide band."""
 
 from __future__ import annotations
-
-from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-#: Unknowns per piece: ten to twenty times the band's usual width.
-_PIECE = 1200
+#: Width of a band, and number of columns, up to which blocks are too small: calls would take longer than the sums.
+_NARROW, _FEW = 48, 4
+#: Share of its largest element below which a column's solution counts as 0.  It falls exponentially, in the end to
+#: numbers so small that processors take a hundred times as long for them.
+_DIED = 1e-12
 
 
 def band_factor(band: np.ndarray) -> np.ndarray | None:
@@ -23,61 +24,77 @@ def band_factor(band: np.ndarray) -> np.ndarray | None:
     return factor if info == 0 else None
 
 
-def forward(factor: np.ndarray, right: np.ndarray, first: np.ndarray | None = None) -> np.ndarray:
+def forward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(N, K) solution of factor times solution = right, in double precision whatever that of the factor.
 
-    first : (K,) ascending, row of the first element of each column that is not 0; None = row 0
+    Of a column only the rows count from its first element that is not 0 to where the solution has died away.
     """
-    from scipy.linalg import get_lapack_funcs
+    from scipy.linalg import get_blas_funcs
 
-    solve = get_lapack_funcs("tbtrs", (factor,))
+    if len(factor) <= _NARROW or right.shape[1] <= _FEW:
+        return _whole(factor, right, "N")
+    multiply, solve = get_blas_funcs(("trmm", "trsm"), (factor,))
+    flat, reach = factor.T.reshape(-1), len(factor) - 1
+    there = right != 0.0
+    start, stop = there.argmax(axis=0), len(right) - there[::-1].argmax(axis=0)
     out = np.zeros(right.shape, factor.dtype)
-    reach = len(factor) - 1
-    for begin, end in _pieces(factor):
-        begun = right.shape[1] if first is None else int(np.searchsorted(first, end))
-        part = np.array(right[begin:end, :begun], factor.dtype, order="F")
+    peak, alive = np.zeros(right.shape[1]), np.zeros(right.shape[1], bool)
+    for begin, end in _blocks(factor):
+        which = np.flatnonzero((start < end) & ((stop > begin) | alive))
+        part = np.array(right[begin:end, which], factor.dtype, order="F")
         if begin:
-            part[:reach] -= (_coupling(factor, begin) @ out[begin - reach : begin, :begun])[: len(part)]
-        out[begin:end, :begun] = solve(factor[:, begin:end], part, uplo="L", overwrite_b=1)[0]
+            before = np.array(out[begin - reach : begin, which], order="F")
+            part -= multiply(1.0, _coupling(flat, reach, begin), before)[: len(part)]
+        part = solve(1.0, _triangle(flat, reach, begin, end), part, lower=1, overwrite_b=1)
+        out[begin:end, which] = part
+        size = np.abs(part).max(axis=0, initial=0.0)
+        peak[which] = np.maximum(peak[which], size)
+        alive[which] = size > _DIED * peak[which]
     return out.astype(np.float64, copy=False)
 
 
 def backward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(N, K) solution of the factor's transpose times solution = right, as of :func:`forward`."""
-    from scipy.linalg import get_lapack_funcs
+    from scipy.linalg import get_blas_funcs
 
-    solve = get_lapack_funcs("tbtrs", (factor,))
+    if len(factor) <= _NARROW or right.shape[1] <= _FEW:
+        return _whole(factor, right, "T")
+    multiply, solve = get_blas_funcs(("trmm", "trsm"), (factor,))
+    flat, reach = factor.T.reshape(-1), len(factor) - 1
     out = np.empty(right.shape, factor.dtype)
-    reach = len(factor) - 1
-    for begin, end in reversed(_pieces(factor)):
+    for begin, end in reversed(_blocks(factor)):
         part = np.array(right[begin:end], factor.dtype, order="F")
         if end < len(right):
-            after = out[end : end + reach]
-            part[-reach:] -= (_coupling(factor, end)[: len(after)].T @ after)[-len(part) :]
-        out[begin:end] = solve(factor[:, begin:end], part, uplo="L", trans="T", overwrite_b=1)[0]
+            after = np.zeros((reach, right.shape[1]), factor.dtype, order="F")
+            after[: len(right) - end] = out[end : end + reach]
+            part -= multiply(1.0, _coupling(flat, reach, end), after, trans_a=1)
+        out[begin:end] = solve(1.0, _triangle(flat, reach, begin, end), part, lower=1, trans_a=1, overwrite_b=1)
     return out.astype(np.float64, copy=False)
 
 
-def _pieces(factor: np.ndarray) -> list[tuple[int, int]]:
-    """Ranges of unknowns, each but the last longer than the band is wide."""
+def _whole(factor: np.ndarray, right: np.ndarray, trans: str) -> np.ndarray:
+    """Solution (N, K) column by column."""
+    from scipy.linalg import get_lapack_funcs
+
+    solve = get_lapack_funcs("tbtrs", (factor,))
+    found = solve(factor, np.array(right, factor.dtype, order="F"), uplo="L", trans=trans, overwrite_b=1)[0]
+    return np.asarray(found, np.float64)
+
+
+def _blocks(factor: np.ndarray) -> list[tuple[int, int]]:
+    """Ranges of unknowns: in blocks one narrower than the band, triangles lie in its memory as LAPACK's matrices do."""
     width, size = factor.shape
-    step = max(_PIECE, width)
-    return [(begin, min(begin + step, size)) for begin in range(0, size, step)]
+    return [(begin, min(begin + width - 1, size)) for begin in range(0, size, width - 1)]
 
 
-def _coupling(factor: np.ndarray, begin: int) -> np.ndarray:
-    """(W - 1, W - 1) of the factor: rows from ``begin`` on, columns before it."""
-    width = len(factor)
-    reach = width - 1
-    flat = factor.T.reshape(-1)[(begin - reach) * width + reach :]
-    # In the band's memory, row i of column j is element i + (W - 1) j.  The triangle beyond the band holds others.
-    rows = min(reach, factor.shape[1] - begin)
-    item = flat.itemsize
-    square = as_strided(flat, (rows, reach), (item, item * reach), writeable=False)
-    return np.where(_upper(rows, reach), square, square.dtype.type(0))
+def _triangle(flat: np.ndarray, reach: int, begin: int, end: int) -> np.ndarray:
+    """Lower triangle (B, B) of the factor at these unknowns; what lies above it is of other unknowns."""
+    # In the band's memory, row i of column j is element i + (W - 1) j.
+    steps = (flat.itemsize, flat.itemsize * reach)
+    return as_strided(flat[begin * (reach + 1) :], (end - begin, end - begin), steps, writeable=False)
 
 
-@lru_cache(maxsize=16)
-def _upper(rows: int, columns: int) -> np.ndarray:
-    """Mask (R, C) of the upper triangle.  It is kept: NumPy's ``triu`` builds a new one for every matrix."""
-    return np.triu(np.ones((rows, columns), bool))
+def _coupling(flat: np.ndarray, reach: int, begin: int) -> np.ndarray:
+    """Upper triangle (B, B) of the factor: rows from ``begin`` on, columns before it; below it lie other unknowns."""
+    place = (begin - reach) * (reach + 1) + reach
+    return flat[place : place + reach**2].reshape((reach, reach), order="F")

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -152,6 +153,18 @@ def _gradient(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarr
     return g, np.concatenate([by_length, by_zoom])
 
 
+@lru_cache(maxsize=1)
+def _band_places() -> tuple[np.ndarray, np.ndarray]:
+    """(N,) places in a frame's rows of the band that spans fill, and (18 * 9, N) signs of their products there."""
+    span, i, j, one, other = np.indices((len(SPANS), 3, 3, 2, 2)).reshape(5, -1)
+    row, column = 3 * SPANS[span, one] + i, 3 * SPANS[span, other] + j
+    kept = column >= row
+    places, number = np.unique(row[kept] * (2 * _SIZE + 1) + (column - row)[kept], return_inverse=True)
+    signs = np.zeros((9 * len(SPANS), len(places)), np.float32)
+    np.add.at(signs, ((9 * span + 3 * i + j)[kept], number), np.where(one == other, 1.0, -1.0)[kept])
+    return places, signs
+
+
 def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
     """Gauss-Newton matrix of the joints, (F * 51, 103) float32: element [i, d] couples unknowns i and i + d."""
     frames = len(p.prior)
@@ -159,21 +172,11 @@ def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
     seen = np.square(r.robust)[..., None] * p.information
     diagonal[..., :2] = seen[..., [0, 2]] + p.prior_weight_xy[..., None]
     diagonal[..., 2] = p.prior_weight_z / r.rounded
-    outer = r.direction[..., :, None] * r.direction[..., None, :] / np.square(SPAN_STD_MM)[:, None, None]
-    outer = outer.astype(np.float32)
-    block = np.zeros((frames, len(BODY_17), 3, len(BODY_17), 3), np.float32)
-    for k, (a, b) in enumerate(SPANS):
-        m = outer[:, k]
-        block[:, a, :, a] += m
-        block[:, b, :, b] += m
-        block[:, a, :, b] -= m
-        block[:, b, :, a] -= m
-    each = np.arange(block.shape[1])
-    block[:, each, 0, each, 1] += seen[..., 1]
-    rows = block.reshape(frames, _SIZE, _SIZE)
+    pull = (r.direction / SPAN_STD_MM[:, None]).astype(np.float32)
+    places, signs = _band_places()
     band = np.zeros((frames, _SIZE, 2 * _SIZE + 1), np.float32)
-    for i in range(_SIZE):
-        band[:, i, : _SIZE - i] = rows[:, i, i:]
+    band.reshape(frames, -1)[:, places] = (pull[..., :, None] * pull[..., None, :]).reshape(frames, -1) @ signs
+    band[:, 0::3, 1] += seen[..., 1]
     band[:, :, 0] += diagonal.reshape(frames, _SIZE)
     if frames > 2:
         w = p.acceleration_weight
@@ -254,9 +257,7 @@ def _descend(p: AdjustmentProblem, here: _Residuals) -> _Residuals | None:
     if factor is None:
         return None
     # Eliminate the joints: half of a solve for every column, the other half for the answer alone.
-    begun = _SIZE * np.argmax(p.zoom_basis > 0, axis=0)
-    first = np.concatenate([np.zeros(1 + len(SPANS), np.intp), begun])
-    y = forward(factor, np.concatenate([-by_joints.reshape(-1, 1), border], axis=1), first)
+    y = forward(factor, np.concatenate([-by_joints.reshape(-1, 1), border], axis=1))
     schur = corner + np.diag(_DAMPING * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
     sizes = np.linalg.solve(schur, -by_sizes - y[:, 1:].T @ y[:, 0])
     joints = backward(factor, y[:, :1] - y[:, 1:] @ sizes[:, None]).reshape(by_joints.shape)
