@@ -65,8 +65,6 @@ def track_people(
         raise InputError("--evidence: expected one person, found several to reconstruct; choose one with --subject N")
     if not needs_networks(path, selection.redetect):
         raise InputError(f"{path}: expected images for several persons, found 2D poses of one; name the video")
-    if config.pose_estimator.feet_model:
-        raise InputError("--feet: expected one person, found several to track; leave it out, or add --subject N")
     people = PeopleEstimator(models_folder(models or config.pose_estimator.models_dir), config.pose_estimator)
     with open_images(path, config.image_ingest, selection.topic) as images:
         meter = selection.clip.meter(progress, "2D pose", images.duration_s)

@@ -54,7 +54,8 @@ class PoseEstimator:
         self.config = config or PoseEstimatorConfig()
         self.pose_model = load_pose_model(models_dir, self.config)
         self.detector = load_detector(models_dir, self.config)
-        self._feet = load_feet_model(models_dir, self.config)
+        #: The second network for feet; None without one.
+        self.feet = load_feet_model(models_dir, self.config)
         #: Notice of a network that is not for images of real people; else empty.
         self.limited_use = limited_use(self.pose_model.model) or limited_use(self.detector.model)
         if self.limited_use:
@@ -262,9 +263,9 @@ class PoseEstimator:
         self, image: np.ndarray, stamp_ns: int, subject: Subject, pose: BodyPose | None = None
     ) -> PoseObservation:
         """The subject in the image; without a pose, its predicted box without keypoints."""
-        joints, size = BODY_19 if self._feet else self._body.joint_map.joints, _size(image)
-        if pose is not None and self._feet is not None:
-            pose = self._feet.add(image, subject.box, pose)
+        joints, size = BODY_19 if self.feet else self._body.joint_map.joints, _size(image)
+        if pose is not None and self.feet is not None:
+            pose = self.feet.add(image, subject.box, pose)
         if pose is None:
             confidence: np.ndarray = np.zeros(len(joints))
             xy, covariance = (np.full((len(joints), n), np.nan) for n in (2, 3))

@@ -27,7 +27,7 @@ from drocap_ros.perception.tracking.limb_colours import limb_colours
 from drocap_ros.perception.tracking.own_joints import Poses, own_joints
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_19
 from drocap_ros.tracks import Tracks
 
 _HIDDEN_S = 2.0  # time without own joints after which a person is sought elsewhere, too
@@ -55,6 +55,7 @@ class PeopleEstimator:
     def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig, threads: int = 2) -> None:
         self._config, self._finder = config, PersonFinder(models_dir, config)
         self._model = BodyPoseModel(self._finder.estimator.pose_model)
+        self._feet = self._finder.estimator.feet
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="people")
         self._scene = Scene()
         #: The scene in the next image, which another thread follows.
@@ -168,12 +169,24 @@ class PeopleEstimator:
             if not others:
                 track.person.update_appearance(describe(image, box))
             track.look(self._colours(image, one, np.where(sure[:, None], xy, np.nan)), free)
-        blank = np.where(own, 1.0, np.nan)[:, None]
-        one.seen[stamp_ns] = PoseObservation(
-            stamp_ns, 1, self._size, self._model.joint_map.joints, box.astype(np.float32), track.person.score,
-            (xy * blank).astype(np.float32), (covariance * blank).astype(np.float32),
-            np.where(own, confidence, 0.0).astype(np.float32),
-        )  # fmt: skip
+        one.seen[stamp_ns] = self._observation(
+            image, stamp_ns, one, BodyPose(xy, covariance, confidence * own, poses[0].network)
+        )
+
+    def _observation(self, image: np.ndarray, stamp_ns: int, one: _Followed, pose: BodyPose) -> PoseObservation:
+        """A pose with the person's own joints, those of its feet by the second network; others have no confidence."""
+        box, joints = one.track.box, self._model.joint_map.joints
+        if self._feet is not None:
+            pose, joints = self._feet.add(image, box, pose), BODY_19
+        inside = ((pose.xy >= 0) & (pose.xy < np.array(self._size))).all(axis=1)
+        seen = inside & (pose.confidence > 0) & (pose.confidence >= self._config.keypoint_threshold)
+        blank = np.where(seen, 1.0, np.nan)[:, None]
+        xy, covariance = (pose.xy * blank).astype(np.float32), (pose.covariance * blank).astype(np.float32)
+        confidence = np.where(seen, pose.confidence, 0.0).astype(np.float32)
+        score, space = one.track.person.score, None if pose.space is None else pose.space.astype(np.float32)
+        return PoseObservation(
+            stamp_ns, 1, self._size, joints, box.astype(np.float32), score, xy, covariance, confidence, space=space
+        )
 
     def _begin(self, image: np.ndarray, stamp_ns: int, found: Person) -> _Followed | None:
         """Whom a detection shows that is nobody's who is in view: one who was hidden or gone, or someone new."""
@@ -212,7 +225,7 @@ class PeopleEstimator:
         seen = pose.confidence >= EMPTY_CONFIDENCE
         for one in self._people:
             if stamp_ns in one.seen:
-                apart = np.linalg.norm(one.seen[stamp_ns].keypoints - pose.xy, axis=1)[seen]
+                apart = np.linalg.norm(one.seen[stamp_ns].keypoints[: len(pose.xy)] - pose.xy, axis=1)[seen]
                 if np.median(np.nan_to_num(apart, nan=np.inf)) < 0.1 * one.track.length:
                     return True
         return False
