@@ -78,12 +78,13 @@ def live(args: argparse.Namespace) -> None:
 
 def live_world(args: argparse.Namespace) -> None:
     pages = []
-    for telemetry in ("exact", "gps"):
+    cases = [WorldCase(telemetry, background=points) for telemetry in ("exact", "gps") for points in (False, True)]
+    for case in cases:
         with progress_bars() as progress:
             rows = live_world_study(
-                args.mocap, telemetry, every=3, delay_s=SOLUTION_DELAY_S, limit=args.limit, progress=progress
+                args.mocap, case, every=3, delay_s=SOLUTION_DELAY_S, limit=args.limit, progress=progress
             )  # fmt: skip
-        pages.append(live_world_markdown(rows, telemetry))
+        pages.append(live_world_markdown(rows, case))
     title = "Live motion in the world beside the offline one"
     write_figures("accuracy_live_world", title, "\n".join(pages))
 

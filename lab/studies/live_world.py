@@ -41,9 +41,8 @@ class LiveWorldRow(NamedTuple):
 
 def live_world_study(
     folder: Path,
-    telemetry: str = "exact",
+    case: WorldCase | None = None,
     *,
-    background: bool = False,
     every: int = 1,
     delay_s: float = 0.5,
     limit: int | None = None,
@@ -60,7 +59,7 @@ def live_world_study(
     """
     sequences = world_sequences(folder, every, limit)
     rows = [
-        _row(sequence.name, world_view(sequence, WorldCase(telemetry, background=background), seed=seed), delay_s)
+        _row(sequence.name, world_view(sequence, case, seed=seed), delay_s)
         for seed, sequence in reported(sequences, len(sequences), "live world study", progress)
     ]
     return [row for row in rows if row is not None]
@@ -142,9 +141,9 @@ def _errors(poses: dict[int, np.ndarray], truth: np.ndarray) -> WorldErrors:
     return world_errors(np.array([poses[i] for i in frames]), truth[frames], FPS / np.diff(frames))
 
 
-def live_world_markdown(rows: list[LiveWorldRow], telemetry: str) -> str:
+def live_world_markdown(rows: list[LiveWorldRow], case: WorldCase) -> str:
     """Errors of every sequence as Markdown: latest, refined, offline."""
-    head = f"Live in `map`, {len(rows)} sequences, {telemetry} telemetry, orbit."
+    head = f"Live in `map`, {len(rows)} sequences, {case.words()}."
     cells = [
         [f"{row.sequence}, {kind}", *world_cells(errors)]
         for row in rows

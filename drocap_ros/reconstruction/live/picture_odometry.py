@@ -29,8 +29,12 @@ from drocap_ros.tracks import Tracks
 
 #: Shortest window (s) in which a path begins: a step and some way, and points in most of it.
 _FIRST_S = 3.0
-#: Time (s) after a search that found no path, until the next: it costs as much as some adjustments.
+#: Time (s) after a search that found no path, until the next, and the longest after more of them: a search costs as
+#: much as some adjustments.
 _PAUSE_S = 4.0
+_LONGEST_PAUSE_S = 60.0
+#: Deviation of the logarithm of a path's metres above which they are guessed: longer windows tell more, of a lens too.
+_LARGEST_SCALE_STD = 0.3
 #: Steps of a path that goes on: most of it is known.
 _STEPS = 5
 #: Error (m) of a place on a path, as windows differ in it.
@@ -72,7 +76,7 @@ class PictureOdometry:
         self._place: tuple[np.ndarray, np.ndarray] | None = None
         #: First image, by its stamp, of the next path, and of the next search for one.
         self.since_ns = self._retry_ns = 0
-        self._number = 0
+        self._number, self._pause_s = 0, _PAUSE_S
         #: Why there is no path, in words.
         self.lost = ""
 
@@ -106,18 +110,25 @@ class PictureOdometry:
         """A path that begins in this window."""
         camera = picture_camera(tracks)
         if camera is None or not camera.kind.known:
-            self._retry_ns = int(tracks.stamp_ns[-1]) + round(_PAUSE_S * 1e9)
-            self.lost = "too few images" if camera is None else f"no path: {camera.kind.value}"
+            self._pause("too few images" if camera is None else camera.kind.value, tracks)
             return None
         tracks = replace(tracks, camera_matrix=camera.matrix)
         per_px = metres_per_px(true_shape(poses.in_image, camera.matrix), tracks.stamp_ns, height_m)
         tracks, world = with_camera(tracks, camera, poses, per_px, config)
+        assert world.upright is not None
+        if world.upright.scale_std > _LARGEST_SCALE_STD:
+            self._pause("neither feet nor ground give its metres", tracks)
+            return None
         if self._place is not None:
             tracks = _from(tracks, *self._place)
-        self._number, self.lost = self._number + 1, ""
+        self._number, self._pause_s, self.lost = self._number + 1, _PAUSE_S, ""
         scale = _way(tracks) / max(float(np.linalg.norm(np.ptp(camera.position, axis=0))), 1e-9)
         drift = np.nan_to_num([scale * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)
         return PicturePath(tracks, world, self._number, int(tracks.stamp_ns[0]), float(drift[0]), float(drift[1]))
+
+    def _pause(self, why: str, tracks: Tracks) -> None:
+        self._retry_ns = int(tracks.stamp_ns[-1]) + round(self._pause_s * 1e9)
+        self._pause_s, self.lost = min(2.0 * self._pause_s, _LONGEST_PAUSE_S), f"no path: {why}"
 
 
 class _Seen:

@@ -7,6 +7,7 @@ import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.protocol import orbit_view
+from drocap_ros.evaluation.world_protocol import WorldCase
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15, BODY_17
@@ -80,12 +81,12 @@ def test_live_poses_in_map_are_measured_beside_the_offline_ones(tmp_path):
         tmp_path / "walk.npz", X=(1000.0 * truth[:, : len(BODY_15)]).astype(np.float32), fps=24.0,
         joints=np.array(BODY_15.joints),
     )  # fmt: skip
-    (row,) = live_world_study(tmp_path, "exact")
+    (row,) = live_world_study(tmp_path, WorldCase("exact"))
     assert 2.0 < row.first_s < 12.0
     assert row.share > 0.9
     assert row.refined.w_mm < 1.3 * row.offline.w_mm + 30.0
     assert row.refined.foot_m_s < 0.2
     assert row.refined.wa_mm < row.latest.wa_mm < 250.0
-    text = live_world_markdown([row], "exact")
+    text = live_world_markdown([row], WorldCase("exact"))
     assert "walk, latest" in text
     assert f"after {row.first_s:.1f} s" in text
