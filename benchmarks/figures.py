@@ -14,6 +14,7 @@ One page per part that can run alone:
     perception.py       perception
     perception_scenes.py perception_scenes
     peers.py            peers
+    perception_people.py perception_people
     recording.py        recording_load, recording_kills, recording_mutations, recording_long, recording_live
     live.py             live_load, live_memory, live_kills
     flight_*.py         flight_faults, flight_processes, flight_orbits, flight_quality, flight_pixels, flight_fuzz,

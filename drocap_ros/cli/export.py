@@ -42,11 +42,24 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export, and print the changes of the motion."""
+    """Export, of a folder of several persons each, and print the changes of the motion."""
+    from drocap_ros.report.people import people_files
+
+    people = people_files(args.motion)
+    if people and args.out:
+        raise InputError(
+            f"--out {args.out}: expected one motion, found persons {', '.join(map(str, people))}; name one"
+        )
+    for path in people.values() or [args.motion]:
+        _export(args, path)
+    return 0
+
+
+def _export(args: argparse.Namespace, argument: Path) -> None:
     from drocap_ros.cli.atomic_output import output_file
     from drocap_ros.export import export
 
-    path, motion = read_motion(args.motion)
+    path, motion = read_motion(argument)
     ending, *kind = args.to.split("-")
     out = args.out or path.with_suffix("".join(f".{word}" for word in (*kind, ending)))
     if out.suffix[1:] in {form.split("-")[0] for form in FORMATS} - {ending}:
@@ -61,4 +74,3 @@ def run(args: argparse.Namespace) -> int:
         print(f"written: {out} ({len(motion.joints)} joints, {FORMATS[args.to]})")
         for note in notes:
             print(f"  {note}")
-    return 0

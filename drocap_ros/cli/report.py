@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,7 +39,10 @@ def run(args: argparse.Namespace) -> int:
     """Write the report, and the video beside it."""
     from drocap_ros.cli.atomic_output import output_file
     from drocap_ros.report.page import save_report
+    from drocap_ros.report.people import people_files
 
+    if people := people_files(args.motion):
+        return _report_people(args, people)
     path, motion = read_motion(args.motion)
     out = args.out or path.with_name("report.html")
     places = [args.video] if args.video else _places(path, str(motion.meta.get("input", "")))
@@ -56,6 +59,25 @@ def run(args: argparse.Namespace) -> int:
             print(f"{'kept the images of the report before' if shown else 'without images'}: {looked}")
         print("".join(f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)\n" for file in (out, *mp4)), end="")
         print(open_words(out))
+    return 0
+
+
+def _report_people(args: argparse.Namespace, files: Mapping[int, Path]) -> int:
+    """Write the one report of several persons."""
+    from drocap_ros.cli.atomic_output import output_file
+    from drocap_ros.motion import load_motion
+    from drocap_ros.report.people import leader, save_people_report
+
+    if args.mp4:
+        raise InputError(f"--mp4: expected one motion, found persons {', '.join(map(str, files))}; name one")
+    people = {number: load_motion(path) for number, path in files.items()}
+    motion, out = people[leader(people)], args.out or args.motion / "report.html"
+    places = [args.video] if args.video else _places(args.motion / "motion.npz", str(motion.meta.get("input", "")))
+    video = args.video or _own_video(motion, places)
+    with output_file(out, inputs=[*files.values(), *places]) as file:
+        save_people_report(file, people, video=video, command=args.command_line)
+    if not args.quiet:
+        print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)\n{open_words(out)}")
     return 0
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.clip import Progress
-from drocap_ros.motion import FILE, Motion, load_motion
+from drocap_ros.motion import FILE, Motion
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 
 #: Time (s) from the last image that shows a person, or to the next one, over which the pose is drawn.
@@ -18,10 +18,12 @@ _UNSEEN_S = 0.5
 _STEADY_S = 0.5
 
 
-def people_in(folder: Path) -> dict[int, Motion]:
-    """Motions in the folders ``person_N`` of a folder, by number; empty where there is none."""
+def people_files(folder: Path) -> dict[int, Path]:
+    """Motion files in the folders ``person_N`` of a folder without a motion of its own, by number."""
+    if not folder.is_dir() or (folder / FILE).exists():
+        return {}
     files = {path.parent.name.removeprefix("person_"): path for path in folder.glob(f"person_*/{FILE}")}
-    return {int(number): load_motion(files[number]) for number in sorted(files, key=int) if number.isdecimal()}
+    return {int(number): files[number] for number in sorted(filter(str.isdecimal, files), key=int)}
 
 
 def leader(people: Mapping[int, Motion]) -> int:

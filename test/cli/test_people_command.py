@@ -87,6 +87,14 @@ def test_report_holds_everybody(out: Path) -> None:
     assert '"people":[{"name":"1"' in page
 
 
+def test_exports_and_a_further_report_are_of_everybody(out: Path, tmp_path: Path) -> None:
+    assert main(["export", str(out), "--to", "bvh", "--quiet"]) == 0
+    assert all((out / f"person_{n}" / "motion.bvh").stat().st_size > 1000 for n in (1, 2, 3))
+    assert main(["export", str(out), "--to", "bvh", "--out", str(tmp_path / "one.bvh")]) == 2
+    assert main(["report", str(out), "--out", str(tmp_path / "again.html"), "--quiet"]) == 0
+    assert "3D motion of 3 persons" in (tmp_path / "again.html").read_text(encoding="utf-8")
+
+
 def test_two_of_three_are_the_same_persons(video: Path, out: Path, tmp_path: Path) -> None:
     words = ["track", str(video), "--subject", "1,3", "--models", "simulation", "--out", str(tmp_path), "--quiet"]
     assert main(words) == 0

@@ -28,8 +28,8 @@ class PeopleScene:
 
     name: str
     seed: int
-    duration_s: float = 12.0
-    rate_hz: float = 15.0
+    duration_s: float = 8.0
+    rate_hz: float = 12.5
     elevation_deg: float = 20.0
     distance_m: float = 8.0
     orbit: bool = True
@@ -40,7 +40,7 @@ class PeopleScene:
         return np.arange(round(self.duration_s * self.rate_hz)) / self.rate_hz
 
 
-SCENES = tuple(PeopleScene(name, seed) for name in ("walk", "cross", "hug") for seed in (1, 2, 3))
+SCENES = tuple(PeopleScene(name, seed) for name in ("hug", "cross", "walk") for seed in (1,))
 
 
 def people_of(scene: PeopleScene) -> list[np.ndarray]:
@@ -58,8 +58,8 @@ def people_of(scene: PeopleScene) -> list[np.ndarray]:
         side = 2.2 * np.cos(2 * u + phase[0])
         paths = [np.stack([side, 0.3 + 0.0 * u], 1), np.stack([-side, -0.3 + 0.0 * u], 1), circle - [0.0, 1.0]]
         return [_along(t, path, scene.seed + 10 * i) for i, path in enumerate(paths)]
-    # Two walk up to each other, hug for three seconds and part; the third passes by.
-    apart = _HUG_M / 2 + 1.8 * np.clip(np.abs(t - scene.duration_s / 2) - 1.5, 0.0, None) ** 2 / 12.0
+    # Two walk up to each other, hug for two seconds and part; the third passes by.
+    apart = _HUG_M / 2 + 1.8 * np.clip(np.abs(t - scene.duration_s / 2) - 1.0, 0.0, None) ** 2 / 6.0
     axis = np.array([np.cos(phase[0]), np.sin(phase[0])])
     pair = [
         _along(t, sign * apart[:, None] * axis, scene.seed + 10 * i, -sign * axis) for i, sign in enumerate((1, -1))
