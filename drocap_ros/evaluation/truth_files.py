@@ -36,8 +36,10 @@ _ALIASES = {
 }
 #: Metres of a unit, as files write it.
 _UNITS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254, "inches": 0.0254}
-#: Thigh and shank of people, m: of a child of two years, and of the tallest man.
-_LEG_M = (0.25, 1.4)
+#: The unit of the CMU database and of BVH files made from it.
+_UNITS["in/0.45"] = 0.0254 / 0.45
+#: Thigh and shank of people, m: of a child of four years, and of the tallest man.
+_LEG_M = (0.4, 1.3)
 #: Share of the line from ankles to shoulders along an axis, from which that is the vertical of the recording.
 _UPRIGHT = 0.8
 #: Turns of axes (x, y, z) to z up, by the vertical.
@@ -129,7 +131,7 @@ def _metres(x: np.ndarray, stated: str) -> tuple[str, float]:
     """The stated unit, else the first with which the legs are those of a person, and its metres."""
     legs = [x[:, [BODY_17.index(side + joint) for joint in ("hip", "knee", "ankle")]] for side in "lr"]
     leg = float(np.median(np.linalg.norm(np.diff(legs, axis=2), axis=3).sum(axis=2)))
-    for unit in dict.fromkeys((stated, "mm", "cm", "m", "in")):
+    for unit in dict.fromkeys((stated, "mm", "cm", "m", "in/0.45", "in")):
         if _LEG_M[0] <= leg * _UNITS[unit] <= _LEG_M[1]:
             return unit, _UNITS[unit]
     raise InputError(f"expected legs of a person in {stated}, found thigh and shank of {leg:.3g}; check the units")

@@ -121,7 +121,14 @@ def test_the_clavicle_of_a_rig_is_no_shoulder(tmp_path, world):
 
 @pytest.mark.parametrize(
     ("unit", "factor", "up", "said"),
-    [("m", 1.0, "y", ""), ("mm", 1.0, "y", "taken as m"), ("mm", 1000.0, "z", "taken as Z up"), ("cm", 100.0, "y", "")],
+    [
+        ("m", 1.0, "y", ""),
+        ("cm", 0.45 / 0.0254, "y", "taken as in/0.45"),
+        ("cm", 1 / 0.0254, "y", "taken as in"),
+        ("mm", 1.0, "y", "taken as m"),
+        ("mm", 1000.0, "z", "taken as Z up"),
+        ("cm", 100.0, "y", ""),
+    ],
 )
 def test_units_and_vertical_fit_the_body_or_are_corrected_in_a_line(tmp_path, world, caplog, unit, factor, up, said):
     path = trc(tmp_path / "truth.trc", list(BODY_15.joints), world.joints3d[:, :15], unit, factor, up)
