@@ -99,7 +99,10 @@ def test_joints_in_space_are_those_of_the_camera_that_looks_past_the_person():
         xy = np.full((count, 2), [x, 300.0], np.float32)
         arrays = np.ones((count, 3), np.float32), np.ones(count, np.float32)
         rows.append(PoseObservation(i * 10**7, 1, size, BODY_19, box, 1.0, xy, *arrays, space=space))
-    toe = tracks_from_observations(rows).evidence[:, BODY_19.index("rtoe")]
+    tracks = tracks_from_observations(rows)
+    wrist, knee = tracks.evidence_sigma[:, [BODY_19.index("lwrist"), BODY_19.index("lknee")]].T
+    assert (wrist > knee).all()
+    toe = tracks.evidence[:, BODY_19.index("rtoe")]
     np.testing.assert_allclose(toe[0], [0, 0, -0.2], atol=1e-3)
     angle = np.arctan(0.5 / 0.85)  # of a lens of 0.85 of the width
     np.testing.assert_allclose(toe[1], -0.2 * np.array([np.sin(angle), 0, np.cos(angle)]), atol=2e-3)
