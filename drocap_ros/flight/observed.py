@@ -132,6 +132,7 @@ class Subject:
     position : (3,) m; None = nobody was located
     contradicted : whether images since he was located showed something else in his place
     nearer : share of his distance by which the nearer of body size and ground puts him nearer
+    size_over_ground : ratio of his distances by body size and by the ground; NaN = unknown
     distance_m : horizontal
     closing_m_s, approach_m_s : speed of the vehicle towards him, and of him towards the vehicle
     approach_sd_m_s : standard deviation of ``approach_m_s``
@@ -144,6 +145,7 @@ class Subject:
     contradicted: bool = False
     sd_m: float = math.inf
     nearer: float = 0.0
+    size_over_ground: float = math.nan
     distance_m: float = math.nan
     closing_m_s: float = 0.0
     approach_m_s: float = 0.0

@@ -24,6 +24,9 @@ from drocap_ros.flight.orbit.states import Limits, SafetyState
 from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
 from drocap_ros.flight.subject.framing import Framing
 
+_SURE_SIZES = 3.0  # of size_error, beyond which the picture contradicts the height
+_TOP_ROOM_M = 0.5  # below max_height_m, as of a goal
+
 
 class FlownOrbit:
     """The orbit and its setpoints.
@@ -90,7 +93,17 @@ class FlownOrbit:
             vehicle=seen.vehicle.position,
             subject=subject.position,
             subject_velocity=subject.velocity,
-            ground_m=config.ground_height_m,
+            ground_m=config.ground_height_m + self._risen_m(seen),
             least_radius_m=max(least, self._framed_radius_m),
             greatest_speed_m_s=coast_speed(seen, self._limits),
         )
+
+    def _risen_m(self, seen: Observed) -> float:
+        """By how much (m) the subject's ground is surely higher below the vehicle than assumed: one never flies lower.
+
+        The range by the ground is too long in proportion where the reported height is too great, or the ground rises.
+        """
+        config, height_m = self._config, seen.vehicle.height_m
+        lower = (1.0 - _SURE_SIZES * config.size_error - seen.subject.size_over_ground) * height_m
+        room_m = config.max_height_m - _TOP_ROOM_M - self.goal.height_m
+        return min(lower, max(room_m, 0.0)) if lower > 0.0 else 0.0  # NaN is not

@@ -262,6 +262,7 @@ def _subject(estimate: SubjectEstimate, offset: np.ndarray, motion: Motion, by_s
         contradicted=estimate.contradicted or (by_size is not None and by_size.contradicted),
         sd_m=estimate.position_sd_m,
         nearer=estimate.nearer,
+        size_over_ground=estimate.size_over_ground,
         distance_m=distance if by_size is None else min(distance, by_size.farthest_m),
         closing_m_s=-float(sight @ motion.velocity[:2]) / max(distance, 1e-3),
         approach_m_s=float(sight @ estimate.velocity[:2]) / max(distance, 1e-3),

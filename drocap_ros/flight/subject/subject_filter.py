@@ -36,6 +36,7 @@ class SubjectEstimate:
     age_s : since then
     contradicted : whether an image since then showed another track, or a subject where this one cannot be
     nearer : share of his distance from the camera by which the nearer of body size and ground puts him nearer
+    size_over_ground : ratio of these two ranges over the last seconds; NaN = unknown
     """
 
     position: np.ndarray
@@ -47,6 +48,7 @@ class SubjectEstimate:
     track_id: int
     contradicted: bool = False
     nearer: float = 0.0
+    size_over_ground: float = float("nan")
 
 
 def _range_noise(
@@ -159,6 +161,7 @@ class SubjectFilter:
             track_id=self._track_id,
             contradicted=self._contradicted,
             nearer=self._nearer,
+            size_over_ground=self._ratio,
         )
 
     def _learn_ratio(self, measurement: SubjectMeasurement, stamp_ns: int) -> None:

@@ -67,7 +67,8 @@ def test_a_camera_that_descends_over_another_ground_sees_a_standing_person_stand
             distances.append(loop.status.radius_m - loop.rows[-1].distance_m)
 
     loop.run(7.0, note)
-    assert loop.copter.body.position[2] < 1.2  # 3 m at the start
+    # From 3 m on, and not to the 0.5 m that are 2.5 m above the configured ground: the picture shows another one.
+    assert 1.2 < loop.copter.body.position[2] < 2.0
     assert np.linalg.norm(places[-1] - places[0]) < 0.7 * 2.0
     assert np.abs(distances).max() < 0.7
 
