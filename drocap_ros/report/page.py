@@ -80,7 +80,7 @@ def render_report(
         plots="".join(_figure(*figure) for figure in _plots(motion, s)),
         provenance=_provenance(motion, command),
         parameters=escape(json.dumps(motion.meta, indent=1, sort_keys=True)),
-        data=script_json(page_data(motion, s, images, placed)),
+        data=script_json(page_data(motion, s, images, people, placed)),
         script="\n".join((folder / name).read_text(encoding="utf-8") for name in _SCRIPTS),
     )
 
@@ -91,7 +91,7 @@ def _subtitle(motion: Motion, people: Mapping[int, Motion] | None) -> str:
     if people is None:
         return f"3D motion of a person, {frame} · method {method}"
     first = next(iter(people))
-    return f"3D motion of {len(people)} persons, {frame} · method {method} · curves and plots: person {first}"
+    return f"3D motion of {len(people)} persons, {frame} · method {method} · plots: person {first}"
 
 
 def _tile(value: str, unit: str, label: str) -> str:

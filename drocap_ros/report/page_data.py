@@ -13,7 +13,7 @@ import numpy as np
 from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
 from drocap_ros.report.motion_images import MotionImages
 from drocap_ros.report.movement import Curve, movement
-from drocap_ros.report.statistics import Statistics
+from drocap_ros.report.statistics import Statistics, motion_statistics
 from drocap_ros.skeleton import side_of
 
 #: Most poses in the page; of longer motions every n-th is shown.
@@ -21,12 +21,17 @@ MAX_POSES = 3000
 
 
 def page_data(
-    motion: Motion, s: Statistics, images: MotionImages | None, people: Mapping[int, Motion] | None = None
+    motion: Motion,
+    s: Statistics,
+    images: MotionImages | None,
+    people: Mapping[int, Motion] | None = None,
+    placed: Mapping[int, Motion] | None = None,
 ) -> dict[str, object]:
     """JSON-compatible data: integers, row-major, null where unknown.
 
     ``pose`` mm and ``camera`` (right, forward; thousandths) in axes with z up; ``keypoints`` tenths of a px;
-    ``people`` holds poses and keypoints of each of several persons on the same frames, None = there is one;
+    ``people`` holds poses, keypoints and movement of each of several persons on the same frames, None = there is one;
+    ``lead`` is whose plots the page has, the first of ``people``; ``placed`` are all on the frames of ``motion``;
     ``heading`` milliradians; ``times`` ms; ``movement`` 1 / ``scale`` of its unit, a list per side.
     """
     shown = shown_frames(motion)
@@ -45,15 +50,24 @@ def page_data(
         "movement": [_curve(curve) for curve in movement(motion, s, shown)],
         "series": {"error": _numbers(s.error_px[shown]), "view": _numbers(s.view_deg[shown])},
         "image": None if images is None else _images(images, shown),
-        "people": None if people is None else [_person(number, other, shown) for number, other in people.items()],
+        "lead": str(next(iter(people or ()), "")),
+        "people": [_person(number, other, people[number], shown) for number, other in placed.items()]
+        if people and placed
+        else None,
     }
 
 
-def _person(number: int, motion: Motion, shown: np.ndarray) -> dict[str, object]:
+def _person(number: int, placed: Motion, own: Motion, shown: np.ndarray) -> dict[str, object]:
+    stamp_ns = placed.stamp_ns[shown]
+    frames = np.searchsorted(own.stamp_ns, stamp_ns).clip(0, len(own.stamp_ns) - 1)
+    curves = movement(own, motion_statistics(own), frames)
+    for curve in curves:
+        curve.values[(stamp_ns < own.stamp_ns[0]) | (stamp_ns > own.stamp_ns[-1])] = np.nan
     return {
         "name": str(number),
-        "pose": _integers(upright_joints(motion)[shown], 1000),
-        "keypoints": _integers(motion.keypoints[shown], 10),
+        "pose": _integers(upright_joints(placed)[shown], 1000),
+        "keypoints": _integers(placed.keypoints[shown], 10),
+        "movement": [_curve(curve) for curve in curves],
     }
 
 

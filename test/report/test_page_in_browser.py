@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from browser import Browser, chromium
 
+from drocap_ros.report.flexion import flexion
 from drocap_ros.report.motion_images import MotionImages
 from drocap_ros.report.page import render_report, save_report
+from drocap_ros.report.people import save_people_report
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome on this machine")
 
@@ -269,6 +271,27 @@ def test_charts_of_movement_follow_the_player_and_are_chosen(browser, pages):
     browser.settle()
     width = browser.run('document.querySelector("#charts svg").clientWidth')
     assert browser.run(cursor) == pytest.approx(36 + (width - 46) / 2, abs=1.0)  # it stands, the lines move
+    assert browser.errors == []
+
+
+def test_charts_of_another_person_keep_the_choice_and_have_the_times_of_the_page(browser, person, tmp_path):
+    """The second person came 20 images later, with other knees."""
+    names = ("joints3d", "stamp_ns", "camera_rotation", "confidence", "keypoints", "reprojection_px")
+    late = dataclasses.replace(person, **{name: getattr(person, name)[20:] for name in names})
+    save_people_report(tmp_path / "two.html", {1: person, 2: late})
+    browser.open(tmp_path / "two.html", 1400, 1000)
+    browser.run('byId("choice").children[0].click()')  # not the knees
+    browser.run('byId("person").value = "2"; byId("person").dispatchEvent(new Event("change"))')
+    browser.run("show(40)")
+    browser.settle()
+    shown = '[...document.querySelectorAll("#charts figure:not([hidden]) figcaption > b")].map((b) => b.textContent)'
+    assert browser.run(shown) == ["Hip bend", "Elbow bend", "Pelvis speed"]
+    values = browser.run("bodies[1].movement[1].values[0]")
+    assert values[:20] == [None] * 20
+    expected = flexion(person.joints3d[20:], person.joints)["hip"][:, 0]
+    np.testing.assert_allclose(np.array(values[20:]) / 10, expected, atol=0.051)
+    said = browser.run('document.querySelector("#charts figure:not([hidden]) output .right b").textContent')
+    assert said == f"{browser.run('(bodies[1].movement[1].values[0][40] / 10).toFixed(0)')}°"
     assert browser.errors == []
 
 

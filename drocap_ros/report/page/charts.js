@@ -86,6 +86,7 @@ function makeChart(curve) {
   svg.addEventListener("pointermove", seek);
   return {
     figure,
+    name: curve.name,
     /** Show a frame; `span` is the time around it in s, 0 = the whole motion. */
     move(frame, span) {
       const time = motion.times[frame], last = Math.max(motion.times[motion.count - 1], 1e-9);
@@ -110,30 +111,38 @@ function makeChart(curve) {
 }
 
 const charts = {
-  all: motion.movement.map(makeChart),
+  all: [],
   span: 0,
   move(frame) {
     for (const chart of this.all) if (!chart.figure.hidden) chart.move(frame, this.span);
   },
+  /** Charts of one person, and buttons that show and hide them; what is chosen stays when the person changes. */
+  fill(movement) {
+    const before = this.all.filter(({ figure }) => !figure.hidden).map(({ name }) => name);
+    const first = this.all.length === 0; // then the angles, and the speed of the whole body
+    this.all = movement.map(makeChart);
+    byId("charts").replaceChildren(...this.all.map(({ figure }) => figure));
+    byId("choice").replaceChildren(...this.all.map(({ figure, name }) => {
+      const button = document.createElement("button");
+      const choose = (on) => {
+        figure.hidden = !on;
+        button.setAttribute("aria-pressed", String(on));
+      };
+      button.type = "button";
+      button.textContent = name;
+      button.addEventListener("click", () => { choose(figure.hidden); redraw(); });
+      choose(first ? name.endsWith("bend") || name.startsWith("Pelvis") : before.includes(name));
+      return button;
+    }));
+  },
 };
 
-/** Buttons that show and hide charts; at first the angles, and the speed of the whole body. */
 (() => {
-  const panel = byId("movement"), list = byId("charts");
-  panel.hidden = !charts.all.length;
-  charts.all.forEach((chart, i) => {
-    const { name } = motion.movement[i], button = document.createElement("button");
-    button.type = "button";
-    button.textContent = name;
-    const choose = (on) => {
-      chart.figure.hidden = !on;
-      button.setAttribute("aria-pressed", String(on));
-    };
-    button.addEventListener("click", () => { choose(chart.figure.hidden); redraw(); });
-    choose(name.endsWith("bend") || name.startsWith("Pelvis"));
-    byId("choice").append(button);
-    list.append(chart.figure);
-  });
+  byId("movement").hidden = !bodies.some(({ movement }) => movement.length);
+  byId("whose").hidden = bodies.length < 2;
+  for (const { name } of motion.people ?? []) byId("person").append(new Option(name, name, false, name === motion.lead));
+  byId("person").addEventListener("change", ({ target }) => { charts.fill(bodies[target.selectedIndex].movement); redraw(); });
   byId("span").addEventListener("change", (event) => { charts.span = Number(event.target.value); redraw(); });
-  new ResizeObserver(() => redraw()).observe(list);
+  charts.fill(motion.movement);
+  new ResizeObserver(() => redraw()).observe(byId("charts"));
 })();
