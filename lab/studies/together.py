@@ -76,7 +76,7 @@ def together_markdown(rows: list[TogetherRow], case: WorldCase) -> str:
         "sequence", "PA mm, one", "two", "W-MPJPE100 mm, one", "two", "scale %", "90 % ellipsoids hold",
         "time off by ms", "deviation said ms",
     )  # fmt: skip
-    mean = [float(np.nanmean(np.abs([row[i] for row in rows]))) for i in range(1, len(head))]
+    mean = [float(np.mean(np.abs([row[i] for row in rows]))) for i in range(1, len(head))]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     lines += [_line(row.sequence, row[1:]) for row in rows]
     lines.append(_line("mean", mean))

@@ -194,4 +194,6 @@ class JoinedProblem:
         total = float((weight[..., None] * np.square(flow)).sum())
         if total <= 0.0:
             return 0.0, np.inf
-        return float((weight[..., None] * flow * off).sum()) / total, total**-0.5
+        # Errors of 2D joints last for some frames.
+        std = (view.config.frames_per_fact / total) ** 0.5
+        return float((weight[..., None] * flow * off).sum()) / total, std
