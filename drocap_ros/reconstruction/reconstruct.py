@@ -60,6 +60,7 @@ class SolvedView(NamedTuple):
     keypoints : of the method's joints
     poses : in px; per_px : (F,) metres per px at the assumed stature
     config : of the adjustment in the world, with the errors of that camera; None = it was not adjusted
+    camera_covariance : (F, 6, 6) of its position (m) and rotation (rad, camera axes) beyond these; None = none
     """
 
     motion: Motion
@@ -68,6 +69,7 @@ class SolvedView(NamedTuple):
     poses: ImagePoses
     per_px: np.ndarray
     config: WorldConfig | None
+    camera_covariance: np.ndarray | None
 
 
 def reconstruct(
@@ -133,7 +135,8 @@ def solve_view(
     shape = true_shape(found.poses.in_image, found.tracks.camera_matrix)
     per_px = metres_per_px(shape, found.tracks.stamp_ns, settings.initializer.assumed_height_m)
     config = world_config(settings.adjuster) if found.source is None else found.source.config
-    return SolvedView(motion, found.tracks, keypoints, found.poses, per_px, config)
+    errors = found.source.covariance if isinstance(found.source, FusedTelemetry) else None
+    return SolvedView(motion, found.tracks, keypoints, found.poses, per_px, config, errors)
 
 
 def _reconstructed(

@@ -317,9 +317,18 @@ def with_fusion(refined: RefinedWorld, fused: FusedTelemetry) -> RefinedWorld:
     return replace(with_camera_errors(refined, fused.covariance), calibration=calibration)
 
 
-def with_camera_errors(refined: RefinedWorld, errors: np.ndarray) -> RefinedWorld:
-    """The adjusted world whose joints are as uncertain as a camera's errors (F, 6, 6) make them, too."""
-    lever = joints_by_camera(refined.joints, refined.rotation, refined.position)
+def with_camera_errors(
+    refined: RefinedWorld, errors: np.ndarray, rotation: np.ndarray | None = None, position: np.ndarray | None = None
+) -> RefinedWorld:
+    """The adjusted world whose joints are as uncertain as a camera's errors (F, 6, 6) make them, too.
+
+    rotation, position : of another camera than ``refined`` has
+    """
+    lever = joints_by_camera(
+        refined.joints,
+        refined.rotation if rotation is None else rotation,
+        refined.position if position is None else position,
+    )
     more = lever @ errors[:, None] @ np.swapaxes(lever, -1, -2)
     return replace(refined, covariance=refined.covariance + more[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
 

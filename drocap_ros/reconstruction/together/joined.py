@@ -51,7 +51,8 @@ def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> 
     moved = _in_world_of(home, views, placed)
     problem = JoinedProblem(moved, home, [offset.seconds for offset in offsets])
     with blas_threads(threads):
-        return _results(problem, problem.solve(), names)
+        refined = problem.with_home_errors(problem.solve())
+        return _results(problem, refined, names)
 
 
 def _best_fit(first: View, view: View, name: str, to: str) -> tuple[TimeOffset, Placement]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.camera.fusion import with_camera_errors
 from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
@@ -58,6 +59,16 @@ class JoinedProblem:
             if max(map(abs, change)) < _SAME_S:
                 break
         return refined
+
+    def with_home_errors(self, refined: RefinedWorld) -> RefinedWorld:
+        """The result whose joints are as uncertain as the camera whose world it is, too."""
+        home = self.views[self.home]
+        errors = home.solved.camera_covariance
+        if errors is None:
+            return refined
+        near = np.searchsorted(home.time_s, self.views[0].time_s - self.offsets[self.home])
+        rotation, position = self.camera(self.home, self.inputs()[self.home], refined)
+        return with_camera_errors(refined, errors[np.minimum(near, len(errors) - 1)], rotation, position)
 
     def inputs(self) -> list[WorldInput]:
         """Every view on the slots of the first one."""
