@@ -14,8 +14,9 @@ from drocap_ros.errors import InputError
 ARRAYS = {"frame": "background_frame", "track": "background_track", "point": "background_point"}
 #: Points beyond it (px) lie in no image: a hundred times the width of the largest.
 _FARTHEST_PX = 1e6
-#: Observations kept of a recording: an hour at 30 Hz with 160 points, 350 MB.
-MOST_ROWS = 17_500_000
+#: Observations kept of a recording: 20 minutes at 30 Hz with 160 points, 120 MB; of an hour those of every fourth
+#: image, with which the tracks of its 4K video stay within 1 GiB.
+MOST_ROWS = 6_000_000
 
 
 @dataclass(frozen=True)

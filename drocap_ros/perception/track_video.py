@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from drocap_ros.background import of_images
+from drocap_ros.background import MOST_ROWS, of_images
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.pinhole import assumed_camera, towards
 from drocap_ros.keypoints import Keypoints2D
@@ -41,18 +42,46 @@ def observe(
     on_frame : called with each frame and its observation, for progress and overlays
     begin_ns : frames before it are observations without a subject
     threads : 1 = this one does everything
+
+    Of a recording with more than ``MOST_ROWS`` of them, the fixed points of every second, fourth ... image are kept.
     """
-    beside = threads > 1
-    observations = []
-    for frame, ahead in with_next(prefetch(frames) if beside else frames):
+    observations: list[PoseObservation] = []
+    thin = _ThinPoints()
+    for frame, ahead in with_next(prefetch(frames) if threads > 1 else frames):
         if begin_ns is not None and frame.stamp_ns < begin_ns:
             observation = PoseObservation(frame.stamp_ns, 0, (frame.image.shape[1], frame.image.shape[0]))
         else:
-            observation = estimator.process(frame.image, frame.stamp_ns, ahead=ahead if beside else None)
-        observations.append(observation)
+            observation = estimator.process(frame.image, frame.stamp_ns, ahead=ahead if threads > 1 else None)
         if on_frame is not None:
             on_frame(frame, observation)
+        observations.append(observation)
+        thin(observations)
     return observations
+
+
+class _ThinPoints:
+    """Keeps the fixed points of every second, fourth ... image where there are more than ``MOST_ROWS`` of them."""
+
+    def __init__(self) -> None:
+        self._rows, self._every = 0, 1
+
+    def __call__(self, observations: list[PoseObservation]) -> None:
+        """After each new observation."""
+        self._drop(observations, len(observations) - 1)
+        self._rows += _rows(observations[-1])
+        if self._rows > MOST_ROWS:
+            self._every *= 2
+            self._drop(observations, 0)
+            self._rows = sum(map(_rows, observations))
+
+    def _drop(self, observations: list[PoseObservation], begin: int) -> None:
+        for i in range(begin, len(observations)):
+            if i % self._every:
+                observations[i] = replace(observations[i], background=None)
+
+
+def _rows(observation: PoseObservation) -> int:
+    return 0 if observation.background is None else len(observation.background)
 
 
 def subjects(observations: Sequence[PoseObservation]) -> list[tuple[int, int]]:

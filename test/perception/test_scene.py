@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from rendered_person import rendered_images
 
+from drocap_ros.perception import track_video
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import SIMULATION, models_folder
 from drocap_ros.perception.scene import Scene
@@ -34,6 +35,16 @@ def test_observations_are_the_same_bit_for_bit_with_one_thread_and_with_more(fra
         if a.background is not None:
             assert np.array_equal(a.background.track, b.background.track)
             assert np.array_equal(a.background.point, b.background.point)
+
+
+def test_of_a_long_recording_the_points_of_every_second_or_fourth_image_are_kept(frames, monkeypatch):
+    monkeypatch.setattr(track_video, "MOST_ROWS", 400)
+    seen = observe(iter(frames[:15]), PoseEstimator(models_folder(SIMULATION)))
+    kept = [i for i, observation in enumerate(seen) if observation.background is not None]
+    assert 2 < len(kept) < 8
+    assert min(np.diff(kept)) in (2, 4)
+    assert not (np.array(kept) % min(np.diff(kept))).any()  # but for the picture that came twice
+    assert sum(len(seen[i].background) for i in kept) <= 400
 
 
 def test_a_step_that_was_begun_for_another_image_is_not_taken(frames):
