@@ -77,8 +77,8 @@ class PictureOdometry:
         #: First image, by its stamp, of the next path, and of the next search for one.
         self.since_ns = self._retry_ns = 0
         self._number, self._pause_s = 0, _PAUSE_S
-        #: Why there is no path, in words.
-        self.lost = ""
+        #: Why there is no path or the last one ended, in words, and how many were lost.
+        self.lost, self.losses = "", 0
 
     def follow(self, tracks: Tracks, poses: ImagePoses, height_m: float, config: WorldConfig) -> PicturePath | None:
         """The path in a window with fixed points; None = there is none, ``lost`` says why.
@@ -91,7 +91,8 @@ class PictureOdometry:
             self._path = _continued(before, tracks) if shared else None
             if self._path is None:
                 self._lose(before, tracks, shared)
-        elif stamps[-1] >= self._retry_ns and stamps[-1] - stamps[0] >= _FIRST_S * 1e9:
+        long = stamps[-1] - stamps[0] >= _FIRST_S * 1e9
+        if self._path is None and self.since_ns <= stamps[0] and stamps[-1] >= self._retry_ns and long:
             self._path = self._begun(tracks, poses, height_m, config)
         return self._path
 
@@ -102,9 +103,16 @@ class PictureOdometry:
         self._place = last.camera_position[-1], last.camera_rotation[-1]
         seen = _Seen(tracks)
         cut = cut_at(seen.sightings)
-        at = int(last.stamp_ns[-1]) if cut is None else int(tracks.stamp_ns[seen.image[seen.knots.frame[cut]]])
-        why = "a cut" if cut is not None else seen.kind(last).value if shared else "a pause"
+        kind = seen.kind(last)
+        if cut is not None:
+            at, why = int(tracks.stamp_ns[seen.image[seen.knots.frame[cut]]]), "a cut"
+        elif shared and kind.known:
+            # A camera that begins to move, say: nothing is wrong with the images of before.
+            at, why = int(tracks.stamp_ns[0]), f"it is {kind.value} now"
+        else:
+            at, why = int(last.stamp_ns[-1]), kind.value if shared else "a pause"
         self.since_ns, self.lost = at, f"path {path.number} lost: {why}; another one begins at its end"
+        self.losses += 1
 
     def _begun(self, tracks: Tracks, poses: ImagePoses, height_m: float, config: WorldConfig) -> PicturePath | None:
         """A path that begins in this window."""
@@ -121,7 +129,7 @@ class PictureOdometry:
             return None
         if self._place is not None:
             tracks = _from(tracks, *self._place)
-        self._number, self._pause_s, self.lost = self._number + 1, _PAUSE_S, ""
+        self._number, self._pause_s = self._number + 1, _PAUSE_S
         scale = _way(tracks) / max(float(np.linalg.norm(np.ptp(camera.position, axis=0))), 1e-9)
         drift = np.nan_to_num([scale * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)
         return PicturePath(tracks, world, self._number, int(tracks.stamp_ns[0]), float(drift[0]), float(drift[1]))

@@ -45,14 +45,15 @@ class PictureWindows:
         use = slice(int(np.searchsorted(w.stamp_ns, max(newest_ns - self._length_ns, self._odometry.since_ns))), None)
         tracks = _tracks(w.frames(use))
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
-        had = self._odometry.lost
+        had = self._odometry.losses
         path = self._odometry.follow(tracks, poses, w.height_m, self._config)
+        lost, why = self._odometry.losses > had, self._odometry.lost
         if path is None:
-            lost = self._odometry.lost
-            return replace(camera_result, picture=lost, lost=lost != had and self._odometry.since_ns > 0)
+            return replace(camera_result, picture=why, lost=lost)
         if self._of != (w.subject, path.number):
             self._of, self._chain = (w.subject, path.number), WorldChain()
-        return replace(self._placed(path, poses, w.keypoints[use], camera_result, w.height_m), picture=path.words)
+        placed = self._placed(path, poses, w.keypoints[use], camera_result, w.height_m)
+        return replace(placed, picture=f"{path.words}; {why}" if lost else path.words, lost=lost)
 
     def _placed(
         self, path: PicturePath, poses: ImagePoses, keypoints: Keypoints2D, seen: AdjustedWindow, height_m: float
