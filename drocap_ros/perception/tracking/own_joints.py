@@ -21,8 +21,8 @@ _SAME = 0.05  # distance of one joint in two poses, lengths
 _FAR = 3.0  # standard deviations from which a joint's place says no more
 _DROP = 4.5  # cost of a joint that is given to nobody: at three deviations,
 _DROP_BODY = 3.0  # and mean cost of a pose that is nobody's
-_FOREIGN = 1.0  # cost of a joint that the pose of another's box gave
 _OTHER_LOOK = 1.5  # deviations of a limb's colour from which it may be another body's
+_STALE_S = 0.3  # time after which an unseen joint may be anywhere: beside another body it stays unseen
 _CLEARLY = 2.0  # times as far from the own body as from the other, from which a joint is the other's
 #: Longest limbs over the length of a standing body, a third more than of most: (joint, its parent) by names.
 _LONGEST = {"knee": 0.36, "ankle": 0.36, "elbow": 0.27, "wrist": 0.24, "shoulder": 0.2, "hip": 0.16, "head": 0.26}
@@ -125,23 +125,12 @@ def _given_before(tracks: Sequence[BodyTrack], poses: Poses, i: int) -> bool:
 
 
 def _joint(tracks: Sequence[BodyTrack], poses: Poses, body: np.ndarray, j: int) -> np.ndarray:
-    """(N,) index of the pose whose joint ``j`` is each body's, -1 = none."""
-    count = len(tracks)
-    found = np.where(body >= 0, body, -1)
-    given = [i for i in range(count) if poses.confidence[i, j] >= _SEEN and i in body]
-    claims = [k for k in range(count) if body[k] >= 0]
-    if len(claims) < 1 or not given:
-        return np.where(np.isin(found, given), found, -1)
-    cost = np.full((len(claims), len(given) + len(claims)), _DROP)
-    for row, k in enumerate(claims):
-        for column, i in enumerate(given):
-            own = float(_cost(tracks[k], poses.xy[i])[j] + 0.5 * _look(tracks[k], poses.colours[i])[j])
-            cost[row, column] = own + (0.0 if body[k] == i else _FOREIGN)
-    rows, columns = linear_sum_assignment(cost)
-    result = np.full(count, -1)
-    for row, column in zip(rows, columns, strict=True):
-        if column < len(given):
-            result[claims[row]] = given[column]
+    """(N,) index of the pose whose joint ``j`` is each body's, its own or -1 = none."""
+    result = body.copy()
+    for k, i in enumerate(body):
+        if i >= 0:
+            cost = _cost(tracks[k], poses.xy[i])[j] + 0.5 * _look(tracks[k], poses.colours[i])[j]
+            result[k] = i if poses.confidence[i, j] >= _SEEN and cost < _DROP else -1
     return _once(tracks, poses, result, j)
 
 
@@ -164,16 +153,17 @@ def _once(tracks: Sequence[BodyTrack], poses: Poses, result: np.ndarray, j: int)
 
 
 def _mixed(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndarray) -> np.ndarray:
-    """(15,) bool: joints (15, 2) px far from where they are expected, and where another body's joint of the kind is."""
+    """(15,) bool: joints (15, 2) px off their expected places, or unseen for long, where another body's may be."""
     count = len(xy)
     own = np.linalg.norm(xy - track.xy[:count], axis=1) / track.reach[:count]
+    stale = (track.stamp_ns - track.joints_ns[:count]) * 1e-9 > _STALE_S
     mixed = np.zeros(count, bool)
     for other in others:
         reach = other.reach[:count]
         same = np.linalg.norm(xy - other.xy[:count], axis=1) / reach
         mirror = np.linalg.norm(xy - other.xy[BODY_15.mirror], axis=1) / reach[BODY_15.mirror]
         theirs = np.minimum(same, mirror)
-        mixed |= (own > 1.5) & (theirs * _CLEARLY < own) & (theirs < _FAR)
+        mixed |= ((own > 1.5) & (theirs * _CLEARLY < own) | stale) & (theirs < _FAR)
     return mixed
 
 

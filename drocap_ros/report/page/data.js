@@ -61,7 +61,7 @@ const floors = (() => {
     return heights.length ? Math.min(...heights) : NaN;
   });
   const sorted = lowest.filter(Number.isFinite).sort((a, b) => a - b);
-  const usual = (sorted[Math.floor(sorted.length * 0.05)] ?? 0) - FOOT;
+  const usual = (sorted[Math.floor(sorted.length * (bodies.length > 1 ? 0.2 : 0.05))] ?? 0) - FOOT;
   return lowest.map((_, f) => {
     const here = motion.world ? NaN : meanAround(lowest, f, 1) - FOOT;
     return Number.isFinite(here) ? here : usual;

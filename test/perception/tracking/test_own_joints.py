@@ -49,11 +49,12 @@ def poses(*xy: np.ndarray) -> Poses:
 
 
 def test_own_poses_stay_with_their_bodies_where_two_cross() -> None:
-    frame = nearest(0, 1)
-    owned = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[0][frame], TRUTH[1][frame]))
-    assert owned.pose.tolist() == [0, 1]
-    assert (owned.joint[0] >= 0).mean() > 0.8
-    assert not (owned.joint[0] == 1).any() or not (owned.joint[1] == 0).any()
+    for frame, least in ((nearest(0, 1), 0.6), (nearest(0, 1) - 3, 0.85)):  # joints at one place are nobody's
+        owned = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[0][frame], TRUTH[1][frame]))
+        assert owned.pose.tolist() == [0, 1]
+        for k in (0, 1):
+            assert (owned.joint[k] >= 0).mean() > least
+            assert not (owned.joint[k] == 1 - k).any()
 
 
 def test_poses_that_the_boxes_exchanged_go_back() -> None:
