@@ -83,7 +83,8 @@ def test_an_adjusted_window_is_near_the_truth() -> None:
     assert limb_lengths(result.joints3d).mean() == pytest.approx(limb_lengths(WALK.in_camera).mean(), rel=0.02)
     spread = limb_lengths(result.joints3d).std(axis=0) / limb_lengths(result.joints3d).mean(axis=0)
     assert spread.max() < 0.06
-    assert (result.covariance[..., 5] > result.covariance[..., 0]).mean() > 0.9
+    about_pelvis = result.covariance[:, 1:]  # of which the pelvis has none
+    assert (about_pelvis[..., 5] > about_pelvis[..., 0]).mean() > 0.9
     assert 1.0 < np.median(result.reprojection_rms_px) < 12.0
 
 
