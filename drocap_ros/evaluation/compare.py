@@ -33,6 +33,7 @@ class WorldErrors:
     foot_m_s, foot_mm : speed of the ankles where the true ones are still, and their step between two frames
     acceleration_ratio : mean acceleration over the truth's; NaN = the truth does not move
     coverage : share of the joints within their own 90 % ellipsoids; NaN = the motion has none, or one about the pelvis
+    coverage_about : the same about the recording's mean place, whose error all joints of all frames have in common
     """
 
     pa_mm: float
@@ -49,10 +50,15 @@ class WorldErrors:
     acceleration_ratio: float
     acceleration_error_m_s2: float
     coverage: float = float("nan")
+    coverage_about: float = float("nan")
 
 
 def world_errors(
-    estimate: np.ndarray, truth: np.ndarray, rate_hz: metrics.Rate, covariance: np.ndarray | None = None
+    estimate: np.ndarray,
+    truth: np.ndarray,
+    rate_hz: metrics.Rate,
+    covariance: np.ndarray | None = None,
+    place: np.ndarray | None = None,
 ) -> WorldErrors:
     """Errors of joints (F, P, 3) m in the world against the truth, both z up; means are over ``BODY_15``.
 
@@ -60,6 +66,7 @@ def world_errors(
 
     rate_hz : frames per second, one number or (F - 1) of the steps
     covariance : (F, P, 6) m^2 of the estimate, or None
+    place : (6,) m^2, the part of it that all joints of all frames have in common, or None
     """
     estimate, truth = estimate[:, : len(BODY_15)], truth[:, : len(BODY_15)]
     nan = float("nan")
@@ -67,6 +74,8 @@ def world_errors(
     foot = metrics.still_foot_speed(estimate, truth, rate_hz) if moving else nan
     known = (np.isfinite(estimate) & np.isfinite(truth)).all(axis=(0, 2))
     est, tru = estimate[:, known], truth[:, known]
+    own = None if covariance is None else covariance[:, : len(BODY_15)][:, known]
+    about = None if own is None or place is None else own - place
     return WorldErrors(
         pa_mm=1000 * float(metrics.pa_mpjpe(estimate, truth).mean()),
         mpjpe_mm=1000 * float(metrics.mpjpe(est, tru).mean()),
@@ -81,10 +90,20 @@ def world_errors(
         penetration_mm=1000 * metrics.penetration(estimate, truth),
         acceleration_ratio=metrics.acceleration_ratio(est, tru, rate_hz) if moving else nan,
         acceleration_error_m_s2=metrics.acceleration_error(est, tru, rate_hz) if moving else nan,
-        coverage=nan
-        if covariance is None
-        else metrics.ellipsoid_coverage(est, tru, covariance[:, : len(BODY_15)][:, known]),
+        coverage=_coverage(est, tru, own),
+        coverage_about=_coverage(est - (est - tru).mean(axis=(0, 1)), tru, about),
     )
+
+
+def _coverage(estimate: np.ndarray, truth: np.ndarray, covariance: np.ndarray | None) -> float:
+    return float("nan") if covariance is None else metrics.ellipsoid_coverage(estimate, truth, covariance)
+
+
+def place_covariance(motion: Motion) -> np.ndarray | None:
+    """(6,) m^2 xx xy xz yy yz zz of a motion's mean place in the world; None = unknown."""
+    windows = motion.meta.get("calibration")
+    found = [window.get("place_covariance_m2") for window in windows] if isinstance(windows, list) else []
+    return np.mean(found, axis=0) if found and all(place is not None for place in found) else None
 
 
 @dataclass(frozen=True)
@@ -175,7 +194,8 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         covariance = None
         if motion.covariance is not None and motion.meta.get("covariance_about") != "pelvis":
             covariance = in_body_order(motion.covariance, motion.joints, LIMB_JOINTS)[usable]
-        in_world = world_errors(estimate, true, 1 / np.diff(at[usable]), covariance)
+        place = None if covariance is None else place_covariance(motion)
+        in_world = world_errors(estimate, true, 1 / np.diff(at[usable]), covariance, place)
     return MotionErrors(
         frames=len(estimate),
         error_mm=1000.0 * float(metrics.pa_mpjpe(estimate, true).mean()),

@@ -49,6 +49,7 @@ _WORLD = {
     "acceleration ratio": ("acceleration_ratio", 1, ".2f"),
     "acceleration error m/s^2": ("acceleration_error_m_s2", 1, ".1f"),
     "in 90 % ellipsoid": ("coverage", 1, ".0%"),
+    "about the mean place": ("coverage_about", 1, ".0%"),
 }
 WORLD_HEAD = list(_WORLD)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from drocap_ros.evaluation.compare import WorldErrors, world_errors
+from drocap_ros.evaluation.compare import WorldErrors, place_covariance, world_errors
 from drocap_ros.evaluation.protocol import FPS, Progress, reported
 from drocap_ros.evaluation.world_protocol import WorldCase, world_view
 from drocap_ros.mocap import Sequence
@@ -29,7 +29,7 @@ def measure_world(sequence: Sequence, case: WorldCase, *, seed: int, method: str
     """Reconstruct one view of one sequence and compare it with the truth."""
     view = world_view(sequence, case, seed=seed)
     motion = reconstruct(view.tracks, method=method)
-    errors = world_errors(motion.joints3d, view.truth, FPS, motion.covariance)
+    errors = world_errors(motion.joints3d, view.truth, FPS, motion.covariance, place_covariance(motion))
     if motion.frame != "world":  # its telemetry was refused: in the camera's axes only the body is comparable
         unknown = dict.fromkeys((field.name for field in fields(WorldErrors)), float("nan"))
         errors = WorldErrors(**unknown | {"pa_mm": errors.pa_mm, "scale": errors.scale})

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.geometry.rotations import exp_so3, log_so3, project_to_so3
 from drocap_ros.reconstruction.camera.path_adjustment import ENOUGH_POINTS, AdjustedPath, adjust_path
 from drocap_ros.reconstruction.camera.path_model import (
     ATTITUDE_LATENCY,
     KNOT,
+    KNOTS_HZ,
     MISALIGNMENT,
     POSITION_LATENCY,
     PathConfig,
@@ -26,7 +28,7 @@ from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
 from drocap_ros.reconstruction.common.windows import fade_weights, windows
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
-from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, at_other_time
 from drocap_ros.reconstruction.world.even_capture import at_all_slots, capture_parts
 from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, turned_at_once
@@ -56,10 +58,6 @@ _FEW = 0.25
 #: Latency (s) from which the reports are shifted, and the largest share of it that its standard deviation may be.
 _LONG_S = 0.02
 _SURE = 0.2
-#: Found wander over the configured one, from which the place is that of a receiver without corrections, and the
-#: standard deviation (m) of such a place: data sheets state that half of all lie within 1.5 m.
-_UNCORRECTED = 2.0
-_RECEIVER_M = 1.0
 #: What the corrected path may still be off by, as a constant: nothing that a body could tell.
 _HELD_DEG = 0.02
 _HELD_S = 0.001
@@ -73,7 +71,8 @@ class FusedTelemetry:
     covariance : (F, 6, 6) of the camera's position (m) and rotation (rad, camera axes)
     config : of the adjustment in the world: what is left of the telemetry's errors
     path : of the longest part, as adjusted
-    measured : JSON-compatible, of the longest part: constant errors and their standard deviations, and the points
+    measured : JSON-compatible, of the longest part: constant errors and their standard deviations, that of the path's
+        mean position (xx, xy, xz, yy, yz, zz m^2), and the points
     """
 
     tracks: Tracks
@@ -115,10 +114,6 @@ def fuse_telemetry(
     assert best is not None  # a recording has a part, and it has a window
     change, covariance, steps = faded.mean()
     measured = _measured(*best)
-    if measured["background"]["position_wander_m"] > _UNCORRECTED * config.position_wander_m:
-        # The place as a whole is none that a recording shows, nor one that its wander tells.
-        missing = np.maximum(_RECEIVER_M**2 - np.diagonal(covariance, axis1=1, axis2=2)[:, :3].mean(axis=0), 0.0)
-        covariance[:, :3, :3] += np.diag(missing)
     corrected = replace(
         tracks,
         camera_rotation=(exp_so3(change[:, 3:]) @ turn)[slot],
@@ -180,17 +175,34 @@ def _adjusted(data: PathInput) -> AdjustedPath | None:
     )
     if max(over) < _OTHER:
         return _without_latency(data, first)
+    position_m = max(position_m, _WIDE_POSITION_M)
     wide = replace(
         own,
         tilt_deg=max(own.tilt_deg, _WIDE_TILT_DEG),
-        position_wander_m=max(position_m, _WIDE_POSITION_M),
+        position_wander_m=position_m,
+        # An error that wanders leaves the line between two knots.
+        jitter_m=max(own.jitter_m, position_m * float(np.sqrt(0.5 / KNOTS_HZ / own.position_wander_s))),
         attitude_wander_deg=max(attitude_deg, _WIDE_ATTITUDE_DEG),
     )
     data = replace(data, config=wide)
     second = adjust_path(data, first.state)
     if second is None or second.posterior is None:
         return first
-    return _without_latency(data, second)
+    return _in_its_place(_without_latency(data, second), position_m, given.fps)
+
+
+def _in_its_place(found: AdjustedPath, expected_m: float, fps: float) -> AdjustedPath:
+    """The path with a place as uncertain as the wander that was found: points tell nothing of the mean error.
+
+    The size of the errors is known by so many independent changes only, so the place has Student's distribution.  What
+    stays the same for hours, as a wrong datum, no wander shows.
+    """
+    assert found.posterior is not None
+    changes = 3.0 * max(len(found.rotation) / fps / _LAG_S, 1.0)
+    wider = max(_wander(found, fps)[0] / expected_m, 1.0) ** 2 * changes / (changes - 2.0)
+    place, pose = found.posterior.place, found.posterior.pose.copy()
+    pose[:, :3, :3] += (wider - 1.0) * place
+    return replace(found, posterior=found.posterior._replace(place=wider * place, pose=pose))
 
 
 def _without_latency(data: PathInput, found: AdjustedPath) -> AdjustedPath:
@@ -212,19 +224,6 @@ def _without_latency(data: PathInput, found: AdjustedPath) -> AdjustedPath:
     precision, vector = again.facts
     vector += precision[:, [ATTITUDE_LATENCY, POSITION_LATENCY]] @ latencies
     return again
-
-
-def at_other_time(given: CameraTelemetry, attitude_s: float, position_s: float) -> CameraTelemetry:
-    """The path with the attitude and the position of so many seconds later, interpolated between its frames."""
-    last = given.frames - 1
-    step = log_so3(given.rotation[1:] @ np.swapaxes(given.rotation[:-1], 1, 2))
-    at = np.arange(given.frames) + attitude_s * given.fps
-    frame = np.clip(np.floor(at).astype(np.intp), 0, last - 1)
-    rotation = exp_so3((at - frame)[:, None] * step[frame]) @ given.rotation[frame]
-    at = np.arange(given.frames) + position_s * given.fps
-    frame = np.clip(np.floor(at).astype(np.intp), 0, last - 1)
-    way = given.position[frame + 1] - given.position[frame]
-    return CameraTelemetry(rotation, given.position[frame] + (at - frame)[:, None] * way, given.fps)
 
 
 def _wander(found: AdjustedPath, fps: float) -> tuple[float, float]:
@@ -277,6 +276,7 @@ def _left(config: WorldConfig, steps: np.ndarray) -> WorldConfig:
         latency_std_s=_HELD_S,
         position_wander_m=float(np.sqrt(np.square(wander[:3]).mean())),
         attitude_wander_deg=float(np.degrees(np.sqrt(np.square(wander[3:]).mean()))),
+        corrected=True,
     )
 
 
@@ -292,6 +292,7 @@ def _measured(found: AdjustedPath, given: CameraTelemetry) -> dict[str, Any]:
         "attitude_latency_std_s": float(found.shared_std[ATTITUDE_LATENCY]),
         "position_latency_s": -float(shared[POSITION_LATENCY]),
         "position_latency_std_s": float(found.shared_std[POSITION_LATENCY]),
+        "place_covariance_m2": pack_covariance(found.posterior.place).tolist(),
         "measured_by": "background",
         "background": {
             "tracks": len(found.views.track),
@@ -313,8 +314,12 @@ def _contradicted(found: AdjustedPath) -> float:
 
 def with_fusion(refined: RefinedWorld, fused: FusedTelemetry) -> RefinedWorld:
     """The adjusted world with what the points measured, and with the camera's own uncertainty in the joints'."""
+    # The place as a whole is the path's: the one of the adjustment has no more to say.
+    about = refined.covariance - refined.place[:, None]
+    place = np.broadcast_to(fused.measured["place_covariance_m2"], refined.place.shape)
     calibration = [{**window, **fused.measured} for window in refined.calibration]
-    return replace(with_camera_errors(refined, fused.covariance), calibration=calibration)
+    refined = replace(refined, place=place, covariance=about, calibration=calibration)
+    return with_camera_errors(refined, fused.covariance)
 
 
 def with_camera_errors(
@@ -330,7 +335,7 @@ def with_camera_errors(
         refined.position if position is None else position,
     )
     more = lever @ errors[:, None] @ np.swapaxes(lever, -1, -2)
-    return replace(refined, covariance=refined.covariance + more[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+    return replace(refined, covariance=refined.covariance + pack_covariance(more))
 
 
 def joints_by_camera(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:

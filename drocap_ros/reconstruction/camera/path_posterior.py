@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,11 @@ from drocap_ros.reconstruction.camera.path_model import ATTITUDE_LATENCY, KNOT, 
 from drocap_ros.reconstruction.camera.path_residuals import PathResiduals
 from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
 
+#: Half of the squared lengths of pairs with a standard deviation of 1 are below it.
+_MEDIAN_SQUARE = 1.39
+#: Weight of a point's unknowns without parallax: rays of 4 s know a depth with a thousand times as much at least.
+ALMOST_NO_WEIGHT = 1e-3
+
 
 class Posterior(NamedTuple):
     """Covariances of K knots, position (m) and rotation (rad, camera axes).
@@ -18,18 +24,20 @@ class Posterior(NamedTuple):
     shared : (SHARED, SHARED) of the shared unknowns
     knots : (K, 6, 6) of the errors
     steps : (K - 1, 6, 6) of the change of the errors from knot to knot
-    pose : (K, 6, 6) of the corrected camera: errors and shared unknowns together
+    place : (3, 3) of the mean position of the path: what all its frames have in common, as points never tell it
+    pose : (K, 6, 6) of the corrected camera: errors and shared unknowns, about that place and with it
     """
 
     shared: np.ndarray
     knots: np.ndarray
     steps: np.ndarray
+    place: np.ndarray
     pose: np.ndarray
 
 
 def posterior_of(r: PathResiduals) -> Posterior | None:
     """Covariances at the solution; None = not positive definite."""
-    equations = PathEquations(r)
+    equations = PathEquations(with_own_noise(r), ALMOST_NO_WEIGHT)
     factor = band_factor(equations.band.copy())
     if factor is None:
         return None
@@ -43,13 +51,25 @@ def posterior_of(r: PathResiduals) -> Posterior | None:
     lever = backward(factor, y).reshape(len(knots), KNOT, -1)
     total = _by_shared(r) - lever
     pose = knots + total @ shared @ np.swapaxes(total, 1, 2)
+    mean = np.tile(np.eye(KNOT)[:, :3] / len(knots), (len(knots), 1))
+    with_place = backward(factor, forward(factor, mean)).reshape(*total.shape[:2], 3)
+    with_place += total @ shared @ total[:, :3].mean(axis=0).T
+    place = with_place[:, :3].mean(axis=0)
+    pose[:, :, :3] -= with_place
+    pose[:, :3] -= np.swapaxes(with_place, 1, 2)
+    pose[:, :3, :3] += 2.0 * place  # about the mean place, and that place itself
     knots = knots + lever @ shared @ np.swapaxes(lever, 1, 2)
     beside = beside + lever[:-1] @ shared @ np.swapaxes(lever[1:], 1, 2)
     steps = knots[1:] + knots[:-1] - beside - np.swapaxes(beside, 1, 2)
-    # Half of the squared lengths of pairs with a standard deviation of 1 are below 1.39.
-    noise = float(np.median(r.square)) / 1.39
-    scale = r.data.config.views_per_fact * max(noise, 1e-12)
-    return Posterior(scale * shared, scale * knots, scale * steps, scale * pose)
+    fact = r.data.config.views_per_fact
+    return Posterior(fact * shared, fact * knots, fact * steps, fact * place, fact * pose)
+
+
+def with_own_noise(r: PathResiduals) -> PathResiduals:
+    """Residuals at the same point and robust weights, with the noise that they show: the priors keep their sizes."""
+    noise = max(float(np.median(r.square)) / _MEDIAN_SQUARE, 1e-12)
+    config = replace(r.data.config, noise_px=r.data.config.noise_px * float(np.sqrt(noise)))
+    return PathResiduals(replace(r.data, config=config), r.weights, r.state, r.outlier / noise)
 
 
 def _by_shared(r: PathResiduals) -> np.ndarray:

@@ -101,6 +101,7 @@ def with_camera(
         position_wander_m=_POSITION_M,
         attitude_wander_deg=_ATTITUDE_DEG,
         checks=False,
+        corrected=True,
     )
     return world, PictureWorld(camera, upright, config if upright.std_deg < _SURE_UP_DEG else None)
 
@@ -120,6 +121,7 @@ def at_assumed_stature(refined: RefinedWorld) -> RefinedWorld:
         refined,
         joints=refined.joints / scale,
         position=refined.position / scale,
+        place=refined.place / scale**2,
         covariance=refined.covariance / scale**2,
         metric=False,
     )

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.geometry.rotations import exp_so3, project_to_so3
-from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, at_other_time, fuse_telemetry, path_config
+from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, path_config
 from drocap_ros.reconstruction.camera.path_model import ATTITUDE_LATENCY, MISALIGNMENT, POSITION_LATENCY
 from drocap_ros.reconstruction.camera.path_residuals import expected_shared
 from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
-from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, at_other_time
 from drocap_ros.reconstruction.world.even_capture import at_all_slots
 from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.world_model import WorldConfig

@@ -79,3 +79,16 @@ class CameraTelemetry:
         path = np.stack([np.interp(inside, at, self._smooth[:, axis]) for axis in range(3)], axis=1)
         ends = np.where((frame < inside)[:, None], self._velocity[0], self._velocity[-1])
         return np.asarray(path + ends * ((frame - inside) / self.fps)[:, None])
+
+
+def at_other_time(given: CameraTelemetry, attitude_s: float, position_s: float) -> CameraTelemetry:
+    """The path with the attitude and the position of so many seconds later, interpolated between its frames."""
+    last = given.frames - 1
+    step = log_so3(given.rotation[1:] @ np.swapaxes(given.rotation[:-1], 1, 2))
+    at = np.arange(given.frames) + attitude_s * given.fps
+    frame = np.clip(np.floor(at).astype(np.intp), 0, last - 1)
+    rotation = exp_so3((at - frame)[:, None] * step[frame]) @ given.rotation[frame]
+    at = np.arange(given.frames) + position_s * given.fps
+    frame = np.clip(np.floor(at).astype(np.intp), 0, last - 1)
+    way = given.position[frame + 1] - given.position[frame]
+    return CameraTelemetry(rotation, given.position[frame] + (at - frame)[:, None] * way, given.fps)

@@ -13,9 +13,11 @@ from drocap_ros.reconstruction.world.world_model import JOINTS, SCALE, WorldStat
 class Posterior(NamedTuple):
     """Covariances at a unit variance of every residual.
 
-    joints : (F, 17, 3, 3) m^2 in the world; shared : of the shared unknowns
+    place : (3, 3) m^2 of the mean place of all joints of all frames, in the world
+    joints : (F, 17, 3, 3) m^2 about it; shared : of the shared unknowns
     """
 
+    place: np.ndarray
     joints: np.ndarray
     shared: np.ndarray
 
@@ -42,7 +44,23 @@ def posterior(matrix: tuple[np.ndarray, np.ndarray, np.ndarray], state: WorldSta
         at = slice(cameras + 3 * joint, cameras + 3 * joint + 3)
         joints[:, joint] = blocks[:, at, at] / scale**2
     weighted = (lever.reshape(-1, shared_size) @ shared).reshape(lever.shape)
-    return Posterior(joints + weighted @ np.swapaxes(lever, -1, -2), shared)
+    joints += weighted @ np.swapaxes(lever, -1, -2)
+    with_place = _with_place(factor, shared, lever, scale)
+    place = with_place.mean(axis=(0, 1))
+    return Posterior(place, joints - with_place - np.swapaxes(with_place, -1, -2) + place, shared)
+
+
+def _with_place(factor: np.ndarray, shared: np.ndarray, lever: np.ndarray, scale: float) -> np.ndarray:
+    """(F, 17, 3, 3) m^2 covariance of the joints with their mean place.
+
+    lever : (F, 17, 3, N) of the joints by the shared unknowns, with the sign turned
+    """
+    frames = len(lever)
+    mean = np.zeros((frames, factor.shape[1] // frames, 3))
+    mean[:, -3 * JOINTS :] = np.tile(np.eye(3), (JOINTS, 1)) / (frames * JOINTS * scale)
+    own = backward(factor, forward(factor, mean.reshape(-1, 3))).reshape(mean.shape)[:, -3 * JOINTS :] / scale
+    by_shared = shared @ lever.mean(axis=(0, 1)).T
+    return np.asarray(own.reshape(frames, JOINTS, 3, 3) + lever @ by_shared)
 
 
 def _diagonal_blocks(factor: np.ndarray, frames: int) -> np.ndarray:

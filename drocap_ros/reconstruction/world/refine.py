@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.contacts import ANKLES
+from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
@@ -66,7 +67,8 @@ class RefinedWorld:
 
     joints : (F, 17, 3) m; rotation : (F, 3, 3) world -> camera; position : (F, 3) m
     metric : whether the scale was measured
-    covariance : (F, 17, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
+    place : (F, 6) m^2 of the mean place of all joints, the same in a window; xx, xy, xz, yy, yz, zz; NaN = unknown
+    covariance : (F, 17, 6) m^2 of the joints, about that place and with it
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
     found : of the last window; before : that window, for the next one
     further : (V, F, 6) of V further views, corrections of the camera's position (m) and rotation (rad, camera axes)
@@ -76,6 +78,7 @@ class RefinedWorld:
     rotation: np.ndarray
     position: np.ndarray
     metric: bool
+    place: np.ndarray
     covariance: np.ndarray
     calibration: list[dict[str, object]]
     found: Findings
@@ -139,7 +142,7 @@ def refine_in_world(
         last = found
     if config.checks and (refusal := facts.refusal()):
         return refusal
-    joints, cameras, wander, covariance = (values[capture.slot] for values in faded.mean())
+    joints, cameras, wander, place, covariance = (values[capture.slot] for values in faded.mean())
     joints += origin
     camera, *further = np.moveaxis(cameras, 1, 0)
     return RefinedWorld(
@@ -147,7 +150,8 @@ def refine_in_world(
         rotation=exp_so3(camera[:, 3:]) @ rotation,
         position=position + camera[:, :3],
         metric=facts.metric,
-        covariance=covariance[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]],
+        place=pack_covariance(place),
+        covariance=pack_covariance(covariance),
         calibration=facts.calibration,
         found=last.findings,
         before=Before(tracks.stamp_ns, joints, wander, last.state.globals[:GLOBALS]),
@@ -219,14 +223,15 @@ class _Faded:
     """Solutions of windows, faded into each other: joints, corrections of the camera, its wander, covariances."""
 
     def __init__(self, slots: int, further: int = 0) -> None:
-        shapes = (JOINTS, 3), (1 + further, CAMERA), (CAMERA,), (JOINTS, 3, 3)
+        shapes = (JOINTS, 3), (1 + further, CAMERA), (CAMERA,), (3, 3), (JOINTS, 3, 3)
         self._sums = [np.zeros((slots, *shape)) for shape in shapes]
         self._weight = np.zeros(slots)
 
     def add(self, window: CaptureWindow, found: WorldSolution, data: WorldInput) -> None:
         views = enumerate((data, *data.further))
         cameras = np.stack([_correction(view_state(found.state, n), view.telemetry) for n, view in views], axis=1)
-        values = found.joints, cameras, found.state.camera[:, :CAMERA], found.covariance
+        place = np.broadcast_to(found.place, (len(found.joints), 3, 3))
+        values = found.joints, cameras, found.state.camera[:, :CAMERA], place, found.covariance + found.place
         for total, value in zip(self._sums, values, strict=True):
             total[window.rows] += _per_frame(window.fade, value) * value
         self._weight[window.rows] += window.fade
@@ -327,4 +332,5 @@ def _calibration(
         "camera_jumps_m": jump_m(position, fps),
         "iterations": found.iterations,
         "stop_reason": found.stop_reason,
+        "place_covariance_m2": None if np.isnan(found.place).any() else pack_covariance(found.place).tolist(),
     }

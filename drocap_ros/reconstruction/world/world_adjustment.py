@@ -60,7 +60,8 @@ class WorldSolution:
     contact : (F - 1, 4) of ``FEET``, right and left ankle, right and left toe
     std : (GLOBALS,) posterior standard deviations of the shared unknowns, NaN = unknown
     turned, turned_std : (3,) rad about the gimbal's axes: pitch, yaw, roll
-    covariance : (F, 17, 3, 3) m^2 of the joints, NaN = unknown
+    place : (3, 3) m^2 of the mean place of all joints, NaN = unknown
+    covariance : (F, 17, 3, 3) m^2 of the joints about it
     ground_spread : m, of the heights of resting feet; NaN = no foot rests
     findings : of this adjustment's measurements, without those known before
     """
@@ -71,6 +72,7 @@ class WorldSolution:
     std: np.ndarray
     turned: np.ndarray
     turned_std: np.ndarray
+    place: np.ndarray
     covariance: np.ndarray
     ground_spread: float
     findings: Findings
@@ -205,17 +207,19 @@ def _solution(final: _Residuals, ground: float, iterations: int, stop_reason: st
     """The solution with its errors, by the posterior covariance where the normal equations have one."""
     data, state = final.data, final.state
     weights = final.weights[0] if isinstance(final, JoinedViews) else final.weights
-    found = posterior(_equations(final)[1], state)
     fact = data.config.frames_per_fact
+    known = _with_terms_that_last(final) if data.config.corrected and isinstance(final, WorldResiduals) else final
+    found = posterior(_equations(known)[1], state)
     axes = data.telemetry.gimbal_axes()
     std, turned_std = np.full(GLOBALS, np.nan), np.full(3, np.nan)
+    place: np.ndarray = np.full((3, 3), np.nan)
     covariance = np.full((*state.joints.shape, 3), np.nan)
     findings = Findings.unknown()
     if found is not None:
         prior = np.sqrt(fact * np.diag(np.linalg.inv(weights.shared)))
         shared = found.shared[:GLOBALS, :GLOBALS]
         std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(shared)), prior)
-        covariance = fact * found.joints
+        place, covariance = fact * found.place, fact * found.joints
         turns = _STD_FACTOR**2 * fact * axes @ shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
         least = fact * axes @ np.linalg.inv(weights.shared[MISALIGNMENT, MISALIGNMENT]) @ axes.T
         turned_std = np.sqrt(np.minimum(np.diag(turns), np.diag(least)))
@@ -227,6 +231,7 @@ def _solution(final: _Residuals, ground: float, iterations: int, stop_reason: st
         std=std,
         turned=axes @ state.globals[MISALIGNMENT],
         turned_std=turned_std,
+        place=place,
         covariance=covariance,
         ground_spread=ground,
         findings=findings,
@@ -234,6 +239,22 @@ def _solution(final: _Residuals, ground: float, iterations: int, stop_reason: st
         iterations=iterations,
         stop_reason=stop_reason,
     )
+
+
+def _with_terms_that_last(final: WorldResiduals) -> WorldResiduals:
+    """Residuals in which only the image's errors and the telemetry's count once in ``frames_per_fact`` frames.
+
+    Weights of contacts and of the lifter's depths contain that they last, and accelerations are what they are.  Without
+    points these terms stay wide: a camera that is turned wrongly bends them all in the same way.
+    """
+    fact, weights = final.data.config.frames_per_fact, final.weights
+    weights = weights._replace(
+        acceleration=fact * weights.acceleration,
+        camera_acceleration=fact * weights.camera_acceleration,
+        depth=fact * weights.depth,
+    )
+    weight, floor_std = fact * final.contact_weight, final.floor_std / float(np.sqrt(fact))
+    return WorldResiduals(final.data, weights, final.state, final.contact, weight, floor_std=floor_std)
 
 
 def _ground_spread(state: WorldState, contact: np.ndarray) -> float:

@@ -48,6 +48,7 @@ class WorldConfig:
         north
     latency_std_s : of attitude and position
     position_wander_m, attitude_wander_deg : standard deviations of the slow errors; rough positions have more
+    corrected : the telemetry is a path that fixed points have corrected
     camera_acceleration_m_s2, acceleration_m_s2 : ordinary ones of the camera and of a joint
     depth_weight : of the lifter's depths
     contact_weight, locked_weight : of feet in contact, less than 1 as contacts last for some frames, and of locked ones
@@ -66,6 +67,7 @@ class WorldConfig:
     latency_std_s: float = 0.1
     position_wander_m: float = 0.05
     attitude_wander_deg: float = 0.1
+    corrected: bool = False
     camera_acceleration_m_s2: float = 3.0
     acceleration_m_s2: float = 16.0
     depth_weight: float = 0.2

@@ -82,7 +82,9 @@ def weights_of(data: WorldInput) -> WorldWeights:
     """Weights from the parameters and from the telemetry's roughness."""
     config, fps = data.config, data.fps
     rough = data.telemetry.roughness() / np.sqrt(2.0 / (WANDER_S[0] * fps))
-    position, attitude = max(config.position_wander_m, rough), np.deg2rad(config.attitude_wander_deg)
+    # What points leave of a receiver's noise is no error that wanders.
+    position = config.position_wander_m if config.corrected else max(config.position_wander_m, rough)
+    attitude = np.deg2rad(config.attitude_wander_deg)
     first = np.repeat([position**-2, attitude**-2], 3)
     wander = first * (0.5 * WANDER_S * fps)
     shared = np.zeros((GLOBALS, GLOBALS))

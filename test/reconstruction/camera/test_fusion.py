@@ -111,6 +111,24 @@ def test_exact_telemetry_stays_exact(true: Scene) -> None:
     assert moved < 0.02
 
 
+def test_the_place_of_a_receiver_is_as_unknown_as_its_wander_whatever_the_noise_of_points(true: Scene) -> None:
+    rotation = exp_so3(np.deg2rad(wave(FRAMES, 1.0))) @ true.rotation
+    given = tracks(true, rotation, true.position + wave(FRAMES, 0.5))
+    points = given.background
+    assert points is not None
+    places = []
+    for noise_px in (0.1, 1.0):
+        noise = np.random.default_rng(3).normal(0.0, noise_px, true.point.shape)
+        found = fused(replace(given, background=replace(points, point=(true.point + noise).astype(np.float32))))
+        places.append(np.sqrt(np.array(found.measured["place_covariance_m2"])[[0, 3, 5]]))
+        # The path's shape is known much better than its place.
+        about = np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3] - np.square(places[-1])
+        assert np.sqrt(about).max() < 0.3
+    # The mean of 7.5 s of an error that lasts for a minute is about as large as the error, 0.5 m as expected.
+    assert (np.abs(np.array(places) - 0.55) < 0.15).all()
+    np.testing.assert_allclose(places[0], places[1], rtol=0.1)
+
+
 def test_neither_origin_nor_north_matters(true: Scene) -> None:
     north, origin = exp_so3(np.array([0.0, 0.0, 1.1])), np.array([4000.0, -900.0, 30.0])
     rotation = exp_so3(np.deg2rad([0.8, -2.0, 0.5])) @ true.rotation

@@ -12,13 +12,15 @@ from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.path_adjustment import adjust_path, initial_state
 from drocap_ros.reconstruction.camera.path_equations import PathEquations
 from drocap_ros.reconstruction.camera.path_model import (
+    ATTITUDE_LATENCY,
     KNOT,
+    MISALIGNMENT,
     POSITION_LATENCY,
     SHARED,
     PathConfig,
     PathInput,
 )
-from drocap_ros.reconstruction.camera.path_posterior import posterior_of
+from drocap_ros.reconstruction.camera.path_posterior import ALMOST_NO_WEIGHT, posterior_of, with_own_noise
 from drocap_ros.reconstruction.camera.path_residuals import PathResiduals, gradient, weights_of
 from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
@@ -128,7 +130,7 @@ def test_noise_free_views_recover_misalignment_wander_and_focal_length_exactly()
 
 def test_deviations_are_those_of_the_dense_inverse() -> None:
     r = residuals(np.random.default_rng(2), given(scene(48, 60), 1.0, 0.1))
-    found, equations = posterior_of(r), PathEquations(r)
+    found, equations = posterior_of(r), PathEquations(with_own_noise(r), ALMOST_NO_WEIGHT)
     assert found is not None
     size = len(equations.border)
     full = np.zeros((size + SHARED, size + SHARED))
@@ -143,6 +145,22 @@ def test_deviations_are_those_of_the_dense_inverse() -> None:
     knots = inverse[:size, :size].reshape(size // KNOT, KNOT, size // KNOT, KNOT)
     for k in range(size // KNOT):
         np.testing.assert_allclose(found.knots[k], scale * knots[k, :, k], rtol=1e-3, atol=1e-9)
+    # What all poses have in common, and what they have beside it.
+    by = np.zeros((size // KNOT, KNOT, size + SHARED))
+    for k in range(size // KNOT):
+        by[k, :, KNOT * k : KNOT * (k + 1)] = np.eye(KNOT)
+    frame = r.data.knots.frame
+    by[:, 3:, size + MISALIGNMENT.start : size + MISALIGNMENT.stop] = np.eye(3)
+    by[:, 3:, size + ATTITUDE_LATENCY] = r.turn_rate[frame]
+    by[:, :3, size + POSITION_LATENCY] = r.velocity[frame]
+    by[..., size:] *= r.weights.free
+    mean = by[:, :3].mean(axis=0)
+    np.testing.assert_allclose(found.place, scale * mean @ inverse @ mean.T, rtol=1e-3, atol=1e-9)
+    by[:, :3] -= mean
+    for k in (0, 5):
+        pose = scale * by[k] @ inverse @ by[k].T
+        pose[:3, :3] += found.place
+        np.testing.assert_allclose(found.pose[k], pose, rtol=1e-3, atol=1e-8)
     step = knots[3, :, 3] + knots[4, :, 4] - knots[3, :, 4] - knots[4, :, 3]
     np.testing.assert_allclose(found.steps[3], scale * step, rtol=1e-3, atol=1e-9)
 
