@@ -15,7 +15,7 @@ from drocap_ros.reconstruction.camera.path_residuals import PathResiduals, gradi
 from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
 
 #: Added to the weight of every point's unknowns, which are about radians: a point without parallax has any depth.  It
-#: shortens steps, and is no knowledge.
+#: also holds the place of a path that nothing else holds, a little.
 POINT_WEIGHT = 10.0
 #: Couplings of the acceleration: two knots on.
 _LEAST_REACH = 3
@@ -33,11 +33,10 @@ class PathEquations:
     """The reduced equations at one point.
 
     band : (6 K, W), element [i, d] couples unknowns i and i + d; border : (6 K, SHARED); corner : (SHARED, SHARED)
-    point_weight : added to the weight of every point's unknowns
     """
 
-    def __init__(self, r: PathResiduals, point_weight: float = POINT_WEIGHT) -> None:
-        self._residuals, self._point_weight = r, point_weight
+    def __init__(self, r: PathResiduals) -> None:
+        self._residuals = r
         views, knots = r.data.views, r.data.knots
         before = knots.before[views.frame]
         self._first = before[views.begin] if len(views.track) else np.zeros(0, np.intp)
@@ -105,7 +104,7 @@ class PathEquations:
         _, by_point, by_camera = r.image_derivatives
         own = by_point[:, 0, :, None] * by_point[:, 0, None] + by_point[:, 1, :, None] * by_point[:, 1, None]
         both = by_point[:, 0, :, None] * by_camera[:, 0, None] + by_point[:, 1, :, None] * by_camera[:, 1, None]
-        inverse = np.linalg.inv(np.linalg.cholesky(views.of_pieces(own) + self._point_weight * np.eye(3)))
+        inverse = np.linalg.inv(np.linalg.cholesky(views.of_pieces(own) + POINT_WEIGHT * np.eye(3)))
         coupling = np.zeros((len(views.track), 3, self._reach, KNOT))
         relative = before - self._first[views.piece]
         key = views.piece * self._reach + relative

@@ -14,8 +14,6 @@ from drocap_ros.reconstruction.common.banded import backward, band_factor, forwa
 
 #: Half of the squared lengths of pairs with a standard deviation of 1 are below it.
 _MEDIAN_SQUARE = 1.39
-#: Weight of a point's unknowns without parallax: rays of 4 s know a depth with a thousand times as much at least.
-ALMOST_NO_WEIGHT = 1e-3
 
 
 class Posterior(NamedTuple):
@@ -37,7 +35,7 @@ class Posterior(NamedTuple):
 
 def posterior_of(r: PathResiduals) -> Posterior | None:
     """Covariances at the solution; None = not positive definite."""
-    equations = PathEquations(with_own_noise(r), ALMOST_NO_WEIGHT)
+    equations = PathEquations(with_own_noise(r))
     factor = band_factor(equations.band.copy())
     if factor is None:
         return None

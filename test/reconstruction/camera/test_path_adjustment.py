@@ -20,7 +20,7 @@ from drocap_ros.reconstruction.camera.path_model import (
     PathConfig,
     PathInput,
 )
-from drocap_ros.reconstruction.camera.path_posterior import ALMOST_NO_WEIGHT, posterior_of, with_own_noise
+from drocap_ros.reconstruction.camera.path_posterior import posterior_of, with_own_noise
 from drocap_ros.reconstruction.camera.path_residuals import PathResiduals, gradient, weights_of
 from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
@@ -130,7 +130,7 @@ def test_noise_free_views_recover_misalignment_wander_and_focal_length_exactly()
 
 def test_deviations_are_those_of_the_dense_inverse() -> None:
     r = residuals(np.random.default_rng(2), given(scene(48, 60), 1.0, 0.1))
-    found, equations = posterior_of(r), PathEquations(with_own_noise(r), ALMOST_NO_WEIGHT)
+    found, equations = posterior_of(r), PathEquations(with_own_noise(r))
     assert found is not None
     size = len(equations.border)
     full = np.zeros((size + SHARED, size + SHARED))
