@@ -38,7 +38,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_command(
         subparsers,
         "reconstruct",
-        run,
+        run_command,
         help="3D motion from a video, recording or tracks file",
         description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz and report.html.",
     )
@@ -127,14 +127,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-report", action="store_true", help="do not write report.html; that of an older run goes")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Reconstruct and write the output folder."""
-    if args.together or args.further:
-        from drocap_ros.cli.together import run_together
+def run_command(args: argparse.Namespace) -> int:
+    """Reconstruct one recording, or several together."""
+    if not (args.together or args.further):
+        return run(args)
+    from drocap_ros.cli.together import run_together
 
-        if args.all:
-            raise InputError("--all: expected one recording, found several; leave out --together, or --all")
-        return run_together(args)
+    if args.all:
+        raise InputError("--all: expected one recording, found several; leave out --together, or --all")
+    return run_together(args)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Reconstruct one recording and write the output folder."""
     begin = time.perf_counter()
     from drocap_ros.cli.atomic_output import default_folder
     from drocap_ros.cli.models import ensure_networks

@@ -204,7 +204,7 @@ def test_missing_joints_and_unknown_options_are_refused(walker):
     clip = y_up(take_of(walker))
     with pytest.raises(InputError, match="missing rwrist"):
         rig_of(clip_with(walker, clip.positions[:, :14], BODY_15.joints[:14], BODY_15.parents[:14]))
-    with pytest.raises(InputError, match="names: expected one of h36m, lafan1, mixamo, got 'vicon'"):
+    with pytest.raises(InputError, match="names: expected one of h36m, lafan1, mixamo, mixamo-three, got 'vicon'"):
         rig_of(clip, names="vicon")
     with pytest.raises(InputError, match="rest: expected one of t, a"):
         rig_of(clip, rest="sitting")
