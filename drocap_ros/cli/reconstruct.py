@@ -130,7 +130,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run_command(args: argparse.Namespace) -> int:
     """Reconstruct one recording, or several together."""
     if not (args.together or args.further):
-        return run(args)
+        return run(args, people_of(args))
     from drocap_ros.cli.together import run_together
 
     if args.all:
@@ -138,8 +138,8 @@ def run_command(args: argparse.Namespace) -> int:
     return run_together(args)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Reconstruct one recording and write the output folder."""
+def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
+    """Reconstruct one recording and write the output folder; ``people`` : of these persons, () = of everybody."""
     begin = time.perf_counter()
     from drocap_ros.cli.atomic_output import default_folder
     from drocap_ros.cli.models import ensure_networks
@@ -153,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.recording.keypoints.files import as_tracks_file
 
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
-    names, people = output_names(args, out, clip), people_of(args)
+    names = output_names(args, out, clip)
     person, rule = parse_subject(args.subject if people is None else "")
     rule |= {"feet_model": args.feet} if args.feet else {}
     config = load_config(args.config).replace("pose_estimator", **rule)
