@@ -29,6 +29,8 @@ def link_findings(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[F
         yield _losses(measured)
     if len(measured.systems) > 1:
         yield _several(config, measured)
+    if measured.others:
+        yield _others(measured)
     for name, stream in measured.streams.items():
         if name != _MOUNT:  # the mount is a check of its own
             verdict, conditions = _rate(config, measured, name, stream)
@@ -59,6 +61,17 @@ def _losses(measured: Measured) -> Verdict:
     wanted = f"below {100 * MAX_LOSS:.0f} %, above it no mode is requested"
     remedy = "let routers pass all packets of the autopilot, or mend the link"
     return Verdict(level, f"{100 * lost:.0f} % lost", wanted, remedy, {"lost": lost})
+
+
+#: Words of MAV_TYPE; others have their number.
+_KINDS = {6: "ground station", 18: "companion computer", 26: "gimbal", 27: "ADS-B receiver", 30: "camera"}
+
+
+@check("others", "who else is heard")
+def _others(measured: Measured) -> Verdict:
+    names = [f"{_KINDS.get(kind, f'type {kind}')} {at[0]}/{at[1]}" for at, kind in sorted(measured.others.items())]
+    values = {"others": ", ".join(names)}
+    return Verdict(graded(), values["others"], "", "", values)
 
 
 @check("vehicles", "vehicles on the link", _C.SEVERAL_VEHICLES)

@@ -51,6 +51,7 @@ class ListeningLink(MavlinkLink):
         self.version = ""
         self.arrivals: defaultdict[str, list[int]] = defaultdict(list)
         self.exchanges: list[tuple[int, int]] = []  # round trip, offset, ns
+        self.others: dict[tuple[int, int], int] = {}  # MAV_TYPE by system and component
         self._version_tries = 0
 
     def check_motion(self, message: Message) -> NoReturn:
@@ -64,7 +65,9 @@ class ListeningLink(MavlinkLink):
         raise AssertionError(f"this link sends no {message.get_type()}")
 
     def _take(self, message: Message, now_ns: int) -> VehicleState | None:
-        name = message.get_type()
+        name, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
+        if name == "HEARTBEAT" and source[1] != mavlink.MAV_COMP_ID_AUTOPILOT1:
+            self.others[source] = message.type
         if name == "TIMESYNC" and message.tc1 and message.ts1 in self._sync_sent:
             trip = now_ns - message.ts1
             self.exchanges.append((trip, message.ts1 + trip // 2 - message.tc1))
@@ -174,7 +177,7 @@ class Listening:
             delays_s=np.array([delay for at, delay in self._delays if at >= from_ns]),
             good_count=sum(map(len, link.arrivals.values())), bad_count=status.bad_count,
             unsigned_count=status.refused_count, packet_loss=link.estimator.packets.loss,
-            systems=link.estimator.systems,
+            systems=link.estimator.systems, others=link.others,
             conditions=tuple(
                 (self._examples[code], self._failed[code] / self._samples) for code in sorted(self._failed)
             ),

@@ -40,6 +40,7 @@ class Measured:
     good_count, bad_count, unsigned_count : messages; data that is none; messages without our signature
     packet_loss : share of the autopilot's last packets that did not arrive
     systems : MAVLink systems of all autopilots on the link
+    others : MAV_TYPE of ground stations, gimbals and the like, by system and component
     conditions : conditions for motion that failed, with the share of the time, in the order of the checks; as if the
         vehicle were armed and in the air
     bridge : state and reason of the running bridge that was listened to; "" = the link itself
@@ -59,6 +60,7 @@ class Measured:
     unsigned_count: int = 0
     packet_loss: float = 0.0
     systems: frozenset[int] = frozenset()
+    others: Mapping[tuple[int, int], int] = field(default_factory=dict)
     conditions: tuple[tuple[Condition, float], ...] = ()
     bridge: str = ""
 

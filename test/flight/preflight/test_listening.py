@@ -60,6 +60,24 @@ class Scene:
         return {code for code, finding in self.findings.items() if finding.level == Level.MISSING}
 
 
+def test_a_ground_station_on_the_link_is_named():
+    def station(scene):
+        link = LoopbackTransport(scene.up, scene.down)
+        mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        scene.step_before = scene.step
+
+        def step():
+            scene.step_before()
+            link.write(mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(mav))
+
+        scene.step = step
+
+    assert "others" not in Scene("px4").findings
+    found = Scene("px4", before=station).findings["others"]
+    assert found.found == "ground station 255/190"
+    assert found.level == Level.OK
+
+
 @BOTH
 def test_a_vehicle_with_everything_set_is_ready_on_the_ground(autopilot):
     scene = Scene(autopilot)
