@@ -36,7 +36,7 @@ class Scene:
         self._motion: np.ndarray | None = None
 
     def step(self, image: np.ndarray, stamp_ns: int, persons: Sequence[np.ndarray]) -> SceneStep:
-        """The scene in the next image (H, W, 3) uint8 BGR; a stamp before the last one begins anew.
+        """The scene in the next image (H, W, 3) uint8 BGR; an earlier stamp than the last one starts a new scene.
 
         persons : boxes (4,) px of two images ago, so that this image need not wait for the last one's persons
         """

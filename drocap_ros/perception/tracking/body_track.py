@@ -11,7 +11,7 @@ from drocap_ros.skeleton import JointSet
 
 _ERROR = 0.05  # of an expected joint at once, lengths: networks err by 0.02, and persons are not steady
 _ERROR_PER_S = {"wrist": 1.2, "elbow": 0.8, "ankle": 1.0, "knee": 0.7}  # and more per second since it was seen,
-_TRUNK_PER_S = 0.5  # of others; a walk swings a wrist by 2 lengths/s, half of which the last speed tells
+_TRUNK_PER_S = 0.5  # of others; a walk swings a wrist by 2 lengths/s, and the last speed predicts half of it
 _LONGEST_S = 1.0  # over which it grows
 _RATE = 0.6  # weight of a new speed
 _DECAY_S = 0.3  # time in which a speed without measurement falls to a third

@@ -60,7 +60,7 @@ class FusedCamera:
     def reset(self) -> None:
         """Forget the reports."""
         self._known = Findings.unknown()
-        #: Images (F,) of the last window, and what their points told.
+        #: Images (F,) of the last window, and the findings of their points.
         self._last: tuple[np.ndarray, Findings] | None = None
         self.calibration: Calibration | None = None
         #: The largest errors (deg, m, deg) that points have shown, which later windows expect from the start.

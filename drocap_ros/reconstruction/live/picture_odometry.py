@@ -218,7 +218,8 @@ def _as_before(
     theirs = np.searchsorted(last.stamp_ns, stamp_ns[here])
     turn = project_to_so3(np.einsum("fki,fkj->ij", last.camera_rotation[theirs], rotation[here]))
     place, theirs_at = position[here] @ turn.T, last.camera_position[theirs]
-    # The path has the metres that it began with, but for what its adjustment shrinks: a way tells, noise does not.
+    # The path keeps the metres that it began with: the adjustment may shrink it.  Only a way longer than the noise
+    # measures by how much.
     spread, theirs_spread = (np.square(p - p.mean(axis=0)).sum(axis=1).mean() for p in (place, theirs_at))
     scale = float(np.sqrt((theirs_spread + _PLACE_M**2) / (spread + _PLACE_M**2)))
     moved = scale * (position @ turn.T - place.mean(axis=0)) + theirs_at.mean(axis=0)

@@ -65,11 +65,11 @@ class WorldChain:
         poses: ImagePoses,
         per_px: np.ndarray,
         config: WorldConfig,
-        told: Findings | None = None,
+        extra: Findings | None = None,
     ) -> RefinedWorld | Refusal | None:
-        """The next window in the world; None = too short.  ``told`` : known of this window, and not handed on."""
+        """The next window in the world; None = too short.  ``extra`` : priors of this window alone."""
         known = self._prior(tracks.stamp_ns)
-        every = known if told is None else known.later(told, 1.0, 0.0)
+        every = known if extra is None else known.later(extra, 1.0, 0.0)
         found = in_world(tracks, keypoints, poses, per_px, config, every, self._before_in(tracks))
         if found.refined is None:
             return found.refusal

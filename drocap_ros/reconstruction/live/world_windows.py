@@ -108,14 +108,14 @@ class WorldWindows:
         if self._by_points != (fused is not None):  # the camera's reports have other errors now
             self._chain.of_scale(stamps)
             self._by_points = fused is not None
-        tracks, config, told = reported, self._config, None
+        tracks, config, extra = reported, self._config, None
         if fused is not None:
             # Feet need not tell whether the reports are true: points have.
             tracks, config = fused.tracks, replace(fused.config, checks=False)
         per_px = metres_per_px(true_shape(poses.in_image, tracks.camera_matrix), stamps, height_m)
         if fused is not None:
-            told = _ground(fused, poses, per_px)
-        refined = self._chain.refined(tracks, keypoints, poses, per_px, self._chain.steps(config, stamps), told)
+            extra = _ground(fused, poses, per_px)
+        refined = self._chain.refined(tracks, keypoints, poses, per_px, self._chain.steps(config, stamps), extra)
         return with_fusion(refined, fused) if fused is not None and isinstance(refined, RefinedWorld) else refined
 
     def _refused(self, camera_result: AdjustedWindow, refusal: Refusal) -> AdjustedWindow:

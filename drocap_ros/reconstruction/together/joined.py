@@ -24,6 +24,8 @@ from drocap_ros.skeleton import BODY_17
 _LEAST_LIKENESS = 0.3
 #: Distance (m) and turn (deg) between a person's places and views in two reported worlds that are the same one.
 _SAME_ORIGIN_M, _SAME_NORTH_DEG = 4.0, 10.0
+#: Of a view whose world is the first one's.
+_SAME_WORLD = Placement(1.0, np.eye(3), np.zeros(3), 0.0)
 
 
 def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> list[Motion]:
@@ -42,14 +44,14 @@ def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> 
     """
     views = [View.of(one, name) for one, name in zip(solved, names, strict=True)]
     first = views[0]
-    offsets, placed = [TimeOffset(0.0, 1.0, 0.0)], [Placement(1.0, np.eye(3), np.zeros(3), 0.0)]
+    offsets, placed = [0.0], [_SAME_WORLD]
     for name, view in zip(names[1:], views[1:], strict=True):
         offset, placement = _best_fit(first, view, name, names[0])
-        offsets.append(offset)
+        offsets.append(offset.seconds)
         placed.append(placement)
     home = _home(views)
     moved = _in_world_of(home, views, placed)
-    problem = JoinedProblem(moved, home, [offset.seconds for offset in offsets])
+    problem = JoinedProblem(moved, home, offsets)
     with blas_threads(threads):
         refined = problem.with_home_errors(problem.solve())
         return _results(problem, refined, names)
@@ -65,7 +67,7 @@ def _best_fit(first: View, view: View, name: str, to: str) -> tuple[TimeOffset, 
             " of the same person at the same time?"
         )
     if first.reported and view.reported and (agreed := _agreed(first, view, found)):
-        return agreed, Placement(1.0, np.eye(3), np.zeros(3), 0.0)
+        return agreed, _SAME_WORLD
     good = [offset for offset in found if offset.likeness > 0.8 * found[0].likeness]
     upright = first.own_world and view.own_world
     fits = [(offset, place_view(first, view, offset.seconds, upright)) for offset in good]

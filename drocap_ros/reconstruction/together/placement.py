@@ -39,7 +39,7 @@ def place_view(first: View, second: View, offset_s: float, upright: bool) -> Pla
     upright : both worlds know up, so they differ by a turn about it
     """
     time = _common_times(first, second, offset_s)
-    a, b = _joints_at(first, time), _joints_at(second, time - offset_s)
+    a, b = first.joints_at(time), second.joints_at(time - offset_s)
     scale = float(np.median(limb_lengths(a).sum(-1)) / np.median(limb_lengths(b).sum(-1)))
     about_a, about_b = a - a[:, :1], scale * (b - b[:, :1])
     rotation, residual = _turn(about_a.reshape(-1, 3), about_b.reshape(-1, 3), upright)
@@ -50,11 +50,6 @@ def place_view(first: View, second: View, offset_s: float, upright: bool) -> Pla
 def _common_times(first: View, second: View, offset_s: float) -> np.ndarray:
     a, b = first.time_s, second.time_s + offset_s
     return np.arange(max(a[0], b[0]), min(a[-1], b[-1]), 1.0 / _RATE_HZ)
-
-
-def _joints_at(view: View, time: np.ndarray) -> np.ndarray:
-    flat = view.joints.reshape(len(view.joints), -1)
-    return np.stack([np.interp(time, view.time_s, column) for column in flat.T], axis=1).reshape(len(time), -1, 3)
 
 
 def _turn(a: np.ndarray, b: np.ndarray, upright: bool) -> tuple[np.ndarray, float]:

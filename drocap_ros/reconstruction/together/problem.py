@@ -21,6 +21,8 @@ from drocap_ros.reconstruction.world.world_model import WorldInput
 _PLACED_M, _PLACED_DEG = 0.5, 5.0
 #: and the slow errors of a path beside those that its own recording knows of, before they are measured.
 _WANDER_M = 0.3
+#: Most of them that is believed: of a receiver without corrections; more is another motion.
+_MOST_WANDER_M = 0.6
 #: Time (s) in which a slow error is measured, and its change in that time over its standard deviation: the path's
 #: errors of WorldResiduals have a time constant of 60 s.
 _CHANGE_S, _CHANGE = 5.0, 0.4
@@ -52,7 +54,8 @@ class JoinedProblem:
             refined = self._adjust(inputs, start)
             self._joints = refined.joints
             late = [self._late(view, n, refined) for n, view in enumerate(inputs)]
-            change = [2.0 * (seconds - late[0][0]) for seconds, _ in late]
+            # The body goes with every view by its share: a view that is alone in being late seems less so.
+            change = [(seconds - late[0][0]) * len(late) / (len(late) - 1) for seconds, _ in late]
             self.offsets = [offset + more for offset, more in zip(self.offsets, change, strict=True)]
             self.offset_std = [std for _, std in late]
             self._doubts = [self._doubt(n, inputs, refined) for n in range(len(inputs))]
@@ -93,19 +96,21 @@ class JoinedProblem:
             return doubt
         (_, there), (_, here) = (self.camera(n, inputs[n], refined) for n in (number, self.home))
         line = there - here
-        line /= np.linalg.norm(line, axis=1, keepdims=True)
+        line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), _LEAST_PLACED_M)
         off = there - inputs[number].telemetry.position[self._slot]
         off -= here - inputs[self.home].telemetry.position[self._slot]
         off -= (off * line).sum(axis=1, keepdims=True) * line
-        later = np.interp(self.views[0].time_s + _CHANGE_S, self.views[0].time_s, np.arange(len(off)))
-        usable = later < len(off) - 1
-        change = off[later[usable].astype(int)] - off[:-1][usable[:-1]] if usable.any() else np.zeros((1, 3))
-        placed, wander = (float(np.sqrt(np.square(e).sum(-1).mean() / 2.0)) for e in (off, change))
-        return Doubt(max(placed, _LEAST_PLACED_M), doubt.placed_deg, min(wander / _CHANGE, _WANDER_M * 2))
+        time = self.views[0].time_s
+        later = np.searchsorted(time, time + _CHANGE_S)
+        rows = np.flatnonzero(later < len(time))
+        placed = _across(off)
+        wander = _across(off[later[rows]] - off[rows]) / _CHANGE if len(rows) else doubt.wander_m
+        return Doubt(max(placed, _LEAST_PLACED_M), doubt.placed_deg, min(wander, _MOST_WANDER_M))
 
     def _start(self, inputs: list[WorldInput]) -> np.ndarray:
         """(F, 17, 3) m nearest to the rays of all views, and to the bodies of each."""
-        single = np.mean([self._bodies(n) for n in range(len(self.views))], axis=0)
+        bodies = [view.joints_at(self._time - own) for view, own in zip(self.views, self.offsets, strict=True)]
+        single = np.mean(bodies, axis=0)
         normal = np.broadcast_to(np.eye(3) / _SINGLE_M**2, (*single.shape, 3)).copy()
         right = single / _SINGLE_M**2
         for view in inputs:
@@ -122,12 +127,6 @@ class JoinedProblem:
             right += (across @ view.telemetry.position[:, None, :, None])[..., 0]
         joints = np.linalg.solve(normal, right[..., None])[..., 0]
         return np.asarray(joints[self._slot])
-
-    def _bodies(self, number: int) -> np.ndarray:
-        """(S, 17, 3) m of one view alone."""
-        view, at = self.views[number], self._time - self.offsets[number]
-        flat = view.joints.reshape(len(view.joints), -1)
-        return np.stack([np.interp(at, view.time_s, column) for column in flat.T], axis=1).reshape(len(at), -1, 3)
 
     def _adjust(self, inputs: list[WorldInput], start: np.ndarray) -> RefinedWorld:
         """One adjustment."""
@@ -208,3 +207,8 @@ class JoinedProblem:
         # Errors of 2D joints last for some frames.
         std = (view.config.frames_per_fact / total) ** 0.5
         return float((weight[..., None] * flow * off).sum()) / total, std
+
+
+def _across(off: np.ndarray) -> float:
+    """Root mean square (m) along each of the two directions that vectors (F, 3) across a line have."""
+    return float(np.sqrt(np.square(off).sum(axis=-1).mean() / 2.0))

@@ -31,12 +31,10 @@ class TimeOffset(NamedTuple):
     """``time of the first = time of the second + seconds``.
 
     likeness : correlation of both motions there, at most 1
-    next_best : that of the best time that is another one
     """
 
     seconds: float
     likeness: float
-    next_best: float
 
 
 class ShownMotion(NamedTuple):
@@ -63,7 +61,7 @@ def time_offsets(first: ShownMotion, second: ShownMotion) -> list[TimeOffset]:
         best = int(left.argmax())
         seconds = (lag[best] + _peak(score, best)) / RATE_HZ + first.time_s[0] - second.time_s[0]
         left[max(best - round(_APART_S * RATE_HZ), 0) : best + round(_APART_S * RATE_HZ) + 1] = 0.0
-        found.append(TimeOffset(float(seconds), float(score[best]), float(left.max())))
+        found.append(TimeOffset(float(seconds), float(score[best])))
     return found
 
 

@@ -19,7 +19,6 @@ from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import place_in_world
 from drocap_ros.reconstruction.world.world_model import PlacedPoses, WorldConfig, WorldInput
 
-_PELVIS = 0
 #: Longest time (s) between two images between which a joint is interpolated.
 _GAP_S = 0.1
 #: Way (m) within which a camera stands.
@@ -80,7 +79,9 @@ class View:
                 # The camera before the adjustment: its errors are to be found with all views.
                 assert given.camera_position is not None
                 rotation, position = given.camera_rotation, given.camera_position
-            config = replace(config or _STANDING, checks=False)
+            # A path whose up is unsure was not adjusted with the body: it errs as any that moves.
+            config = config or (_STANDING if np.ptp(position, axis=0).max() < _STANDS_M else WorldConfig())
+            config = replace(config, checks=False)
             return View(solved, joints, rotation, position, True, reported, config)
         turn = np.broadcast_to(LEVEL_CAMERA, motion.camera_rotation.shape).copy()
         path = np.zeros((len(joints), 3))
@@ -93,6 +94,12 @@ class View:
         """(F,) s since the first image."""
         stamps = self.solved.tracks.stamp_ns
         return np.asarray((stamps - stamps[0]) * 1e-9)
+
+    def joints_at(self, time_s: np.ndarray) -> np.ndarray:
+        """(S, 17, 3) m of the body as this view alone has it, at times (S,) s of its clock."""
+        flat = self.joints.reshape(len(self.joints), -1)
+        at = np.stack([np.interp(time_s, self.time_s, column) for column in flat.T], axis=1)
+        return at.reshape(len(time_s), -1, 3)
 
     def shown(self) -> ShownMotion:
         """The motion with the images that show it."""
@@ -157,10 +164,9 @@ class View:
 
     def _depth(self) -> tuple[np.ndarray, np.ndarray]:
         """(F, 17) m expected error of depths behind the pelvis, and these."""
-        poses, size = self.solved.poses, self.solved.per_px[:, None]
+        poses, per_px = self.solved.poses, self.solved.per_px
         assert poses.sigma_px is not None
-        relief = poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]
-        return poses.sigma_px[..., 1] * size, relief * size
+        return poses.sigma_px[..., 1] * per_px[:, None], in_camera_axes(poses, per_px)[..., 2]
 
 
 def _image(solved: SolvedView) -> np.ndarray:
@@ -175,16 +181,12 @@ class _Between:
     """
 
     def __init__(self, own_s: np.ndarray, before: np.ndarray, after: np.ndarray, time_s: np.ndarray) -> None:
-        self._rows = (
-            (before, after)
-            if before.ndim == 1
-            else ((before, np.arange(before.shape[1])), (after, np.arange(before.shape[1])))
-        )
+        joints = () if before.ndim == 1 else (np.arange(before.shape[1]),)
+        self._rows = (before, *joints), (after, *joints)
         time_s = time_s.reshape(-1, *(1,) * (before.ndim - 1))
         gap = own_s[after] - own_s[before]
-        self._part = np.where(
-            gap > 0.0, np.clip((time_s - own_s[before]) / np.where(gap > 0.0, gap, 1.0), 0.0, 1.0), 0.0
-        )
+        # In no time nothing is passed.
+        self._part = np.clip((time_s - own_s[before]) / np.where(gap > 0.0, gap, np.inf), 0.0, 1.0)
         near = gap < max(_GAP_S, 1.5 * usual_step(own_s))
         self.inside = near & (time_s >= own_s[before]) & (time_s <= own_s[after])
 
