@@ -117,13 +117,15 @@ def closing_speeds(loop: OrbitLoop) -> tuple[float, float, float]:
 
 
 def breaches(settings: LoopSettings, loop: OrbitLoop) -> list[str]:
-    """Limits that the true vehicle broke after the start.
+    """Limits that the true vehicle broke from its first orbit on: before, its autopilot holds it without the bridge.
 
     Places in the map count with 0.6 m for the errors of the vehicle's own position; the distance from the person,
     which does not depend on it, with nothing.
     """
-    config, rows = settings.config, [row for row in loop.rows if row.t_s > SETTLE_S]
-    found = []
+    config, found = settings.config, []
+    rows = list(itertools.dropwhile(lambda row: row.state != State.ORBITING, loop.rows))
+    if not rows:
+        return found
     nearest = least_distance(loop)
     if nearest < config.min_distance_m:
         found.append(f"distance {nearest:.2f} m")
@@ -152,6 +154,7 @@ def outcome(seed: int) -> dict[str, Any]:
     settings, loop = fly(seed)
     rows = [row for row in loop.rows if row.t_s > SETTLE_S]
     orbiting = [row.state == State.ORBITING for row in rows]
+    hovers = itertools.takewhile(lambda row: row.state != State.ORBITING, loop.rows)
     settled = [row.distance_m - settings.config.radius_m for row in rows if row.t_s > 14.0]
     reasons = [(state, reason) for t, state, reason in loop.reasons if t > SETTLE_S]
     stops = [
@@ -163,7 +166,8 @@ def outcome(seed: int) -> dict[str, Any]:
     whole = all(row.state == State.ORBITING for row in rows if row.t_s > 14.0)
     return {
         "seed": seed, "code": _CODE, "autopilot": settings.autopilot, "action": settings.action,
-        "breaches": breaches(settings, loop), "least_distance_m": round(least_distance(loop), 3),
+        "breaches": breaches(settings, loop), "hover_m": round(min(float(row.position[2]) for row in hovers), 2),
+        "least_distance_m": round(least_distance(loop), 3),
         "closing_m_s": round(own, 2), "beyond_m_s": round(beyond, 2), "loss_m_s": round(loss, 2),
         "perception": PerceptionErrors.drawn(seed).kind,
         "orbiting": round(float(np.mean(orbiting)), 3), "flown": any(orbiting), "held": stops[:3],
@@ -199,10 +203,12 @@ def table(first: int, count: int) -> int:
     flown = [row for row in rows if row["flown"]]
     errors = [row["radius_error_m"] for row in rows if row["radius_error_m"] is not None]
     near = sorted(row["least_distance_m"] for row in flown)
+    hovers = sorted((row["hover_m"], f"{row['autopilot']}, seed {row['seed']}") for row in rows)
+    lowest = "; ".join(f"{height_m:.2f} ({which})" for height_m, which in hovers[:3])
     lines = [
         ["orbits", f"{len(rows)} of {count}, {len({row['code'] for row in rows})} version(s) of the code"],
         ["with a breach", f"{len(bad)} " + "; ".join(f"seed {r['seed']}: {', '.join(r['breaches'])}" for r in bad)],
-        ["of them flown, not refused", sum(row["flown"] for row in bad)],
+        ["least heights before the first orbit, held by the autopilot alone, m", lowest],
         ["flown", len(flown)],
         ["orbited without a stop from 14 s to the end", len(errors)],
         ["time in ORBITING after the first start, %", f"{100 * np.mean([row['orbiting'] for row in rows]):.0f}"],
