@@ -4,11 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from threadpoolctl import ThreadpoolController
 
 
 @contextmanager
@@ -19,21 +14,14 @@ def blas_threads(count: int) -> Iterator[None]:
     another process uses the core (measured), and makes the last bits depend on the machine.  Without threadpoolctl
     the environment's setting (``OMP_NUM_THREADS``) applies.
     """
-    controller = _controller()
-    if controller is None:
-        yield
-    else:
-        with controller.limit(limits=count, user_api="blas"):
-            yield
-
-
-@lru_cache(maxsize=1)
-def _controller() -> ThreadpoolController | None:
     try:
-        from threadpoolctl import ThreadpoolController
+        from threadpoolctl import threadpool_limits
     except ImportError:
-        return None
-    # The controller covers only loaded libraries: scipy has a BLAS beside numpy's.
+        yield
+        return
+    # The limit covers only loaded libraries: scipy has a BLAS beside numpy's.  OpenCV's third one may come at any
+    # time, so that the libraries are looked up at each call (1 ms, measured).
     import scipy.linalg  # noqa: F401
 
-    return ThreadpoolController()
+    with threadpool_limits(limits=count, user_api="blas"):
+        yield
