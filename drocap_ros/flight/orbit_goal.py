@@ -18,6 +18,19 @@ class OrbitGoal(NamedTuple):
     angular_speed_rad_s: float
 
 
+class Wish(NamedTuple):
+    """What a plan wishes, as an operator who adjusts the orbit; it is judged by the same limits.
+
+    until_s : monotonic time from which on it is outdated
+    why : in words
+    """
+
+    height_m: float
+    angular_speed_deg_s: float
+    until_s: float
+    why: str
+
+
 def goal_of(
     config: OrbitConfig,
     radius_m: float = math.nan,

@@ -27,6 +27,7 @@ from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Limits, ModeRequest, OperatorCommand, SafetyState, State
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.orbit.way_out import way_out
+from drocap_ros.flight.orbit_goal import Wish
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.observation import PoseObservation
 
@@ -88,6 +89,11 @@ class OrbitController:
         with self._lock:
             self._desk.take(command)
 
+    def on_wish(self, wish: Wish | str) -> None:
+        """Take a plan's wish, or why it has none: it counts where the orbit's plan is ``ACCURACY``."""
+        with self._lock:
+            self._orbit.wish = wish
+
     # -- one step --------------------------------------------------------------------------------------
     def step(self, now_ns: int, now_s: float) -> ControlStatus:
         """One step of the control loop.
@@ -131,8 +137,9 @@ class OrbitController:
         self.safety, decision = reduce(before, seen, now_s, order.kind if order else None, limits)
         if order is not None and decision.answer is not None:
             self._desk.answer(order.command, decision.answer)
-            if order.goal is not None and decision.answer.accepted:
-                self._orbit.goal = order.goal
+            if decision.answer.accepted:
+                self._orbit.take(order)
+        self._orbit.choose(self._observer.framing, now_s)
         if hung and not seen.jumped:
             self._hold_as_watchdog()
         if self.safety.state != before.state:

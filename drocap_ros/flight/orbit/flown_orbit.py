@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.conditions import Condition
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed
+from drocap_ros.flight.orbit.command_checks import Order, commanded_goal
 from drocap_ros.flight.orbit.control_status import widened_condition
 from drocap_ros.flight.orbit.degradation import slowed
 from drocap_ros.flight.orbit.last_setpoint import Shortfall, coast_speed, harmless, limit_closing, slowed_condition
@@ -20,24 +23,33 @@ from drocap_ros.flight.orbit.planner import (
     reference_position,
     setpoint_of,
 )
-from drocap_ros.flight.orbit.states import Limits, SafetyState
-from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
+from drocap_ros.flight.orbit.states import Command, Limits, OperatorCommand, SafetyState
+from drocap_ros.flight.orbit_config import ACCURACY
+from drocap_ros.flight.orbit_goal import OrbitGoal, Wish, goal_of
 from drocap_ros.flight.subject.framing import Framing
 
 _SURE_SIZES = 3.0  # of size_error, beyond which the picture contradicts the height
 _TOP_ROOM_M = 0.5  # below max_height_m, as of a goal
+NO_POSES = "no adjusted poses (pose3d/refined) have arrived"
+NO_NEWER = "no newer adjusted poses (pose3d/refined) arrive"
+_FLOWN = (ConditionCode.ORBITING, ConditionCode.WIDENED, ConditionCode.SLOWED)
 
 
 class FlownOrbit:
     """The orbit and its setpoints.
 
     goal : of the last accepted command
+    plan : by which height and angular speed are chosen, one of ``PLANS``
+    wish : the newest one of the plan, or why there is none
     unsafe : why the last setpoint was not sent; None = it was
     """
 
     def __init__(self, config: MavlinkBridgeConfig, limits: Limits) -> None:
         self._config, self._limits = config, limits
         self.goal: OrbitGoal = goal_of(config)
+        self.plan = config.plan
+        self.wish: Wish | str = NO_POSES
+        self._flown, self._unplanned = self.goal, ""
         self.unsafe: Condition | None = None
         self._reference: OrbitState | None = None
         self._shortfall = Shortfall()
@@ -47,6 +59,30 @@ class FlownOrbit:
     def place(self) -> np.ndarray | None:
         """(3,) m ENU, place of the vehicle on the orbit; None = no orbit is flown."""
         return None if self._reference is None else reference_position(self._reference)
+
+    def take(self, order: Order) -> None:
+        """Take an accepted order's goal and plan."""
+        if order.goal is not None:
+            self.goal = order.goal
+            self.plan = order.command.plan or (self.plan if order.kind == Command.ADJUST else self._config.plan)
+
+    def choose(self, framing: Framing, now_s: float) -> None:
+        """Choose what is flown now: the goal, or with a plan its wish, judged as an operator who adjusts the goal."""
+        self._flown, self._unplanned = self.goal, ""
+        if self.plan != ACCURACY:
+            return
+        wish = self.wish
+        if isinstance(wish, str) or wish.until_s < now_s:
+            self._unplanned = wish if isinstance(wish, str) else NO_NEWER
+            return
+        fastest = abs(math.degrees(self.goal.angular_speed_rad_s))
+        speed = min(max(wish.angular_speed_deg_s, -fastest), fastest)
+        adjust = OperatorCommand(int(Command.ADJUST), height_m=wish.height_m, angular_speed_deg_s=speed)
+        judged = commanded_goal(self._config, adjust, self.goal, framing)
+        if isinstance(judged, Condition):
+            self._unplanned = str(judged)
+        else:
+            self._flown = judged
 
     def begin(self, seen: Observed) -> None:
         """Begin an orbit where the vehicle is."""
@@ -65,7 +101,7 @@ class FlownOrbit:
             return None
         config, limits, pace = self._config, self._limits, safety.pace
         scene = self._scene(seen, framing)
-        reference = self._reference = advance(self._reference, self.goal, scene, dt * pace.value, config)
+        reference = self._reference = advance(self._reference, self._flown, scene, dt * pace.value, config)
         planned = setpoint_of(reference, scene, config)
         pushed = self._shortfall.added(planned, seen, reference.centre_velocity)
         paced = slowed(pushed, pace, config.max_acceleration_m_s2)
@@ -78,8 +114,19 @@ class FlownOrbit:
         """The condition of the machine, with the radius and the speed that are flown where these are not the goal's."""
         if self._reference is None:
             return present
-        widened, goal = widened_condition(present, self.goal, self._reference, self._framed_radius_m, self._config)
-        return slowed_condition(widened, goal, seen, self._limits)
+        widened, goal = widened_condition(present, self._flown, self._reference, self._framed_radius_m, self._config)
+        slower = slowed_condition(widened, goal, seen, self._limits)
+        if self.plan != ACCURACY or slower.code not in _FLOWN:
+            return slower
+        if self._unplanned:
+            return condition(ConditionCode.UNPLANNED, cause=slower, why=self._unplanned)
+        return condition(
+            ConditionCode.PLANNED,
+            cause=slower,
+            speed_deg_s=math.degrees(self._flown.angular_speed_rad_s),
+            height_m=self._flown.height_m,
+            why=self.wish.why if isinstance(self.wish, Wish) else "",
+        )
 
     def _scene(self, seen: Observed, framing: Framing) -> Scene:
         subject, config = seen.subject, self._config
@@ -88,7 +135,7 @@ class FlownOrbit:
         least = least_radius(
             config, subject.sd_m, speed, config.braking_m_s2, config.size_error, subject.nearer * subject.distance_m
         )
-        self._framed_radius_m = framing.least_radius(self.goal, speed, seen.autopilot.gives_way_s)
+        self._framed_radius_m = framing.least_radius(self._flown, speed, seen.autopilot.gives_way_s)
         return Scene(
             vehicle=seen.vehicle.position,
             subject=subject.position,
@@ -105,5 +152,5 @@ class FlownOrbit:
         """
         config, height_m = self._config, seen.vehicle.height_m
         lower = (1.0 - _SURE_SIZES * config.size_error - seen.subject.size_over_ground) * height_m
-        room_m = config.max_height_m - _TOP_ROOM_M - self.goal.height_m
+        room_m = config.max_height_m - _TOP_ROOM_M - self._flown.height_m
         return min(lower, max(room_m, 0.0)) if lower > 0.0 else 0.0  # NaN is not
