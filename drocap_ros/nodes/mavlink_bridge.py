@@ -22,6 +22,7 @@ from sensor_msgs.msg import CameraInfo
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import optical_orientation
+from drocap_ros.flight.mavlink.guardian import GuardianProcess
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.telemetry_request import LinkStatus
 from drocap_ros.flight.orbit.control_status import ControlStatus
@@ -78,7 +79,8 @@ class MavlinkBridgeNode(ComponentNode):
             )
         self._stepped = self.transport is not None
         self._link = MavlinkLink(self.config, self.now_ns, monotonic_s=self.now_s, transport=self.transport)
-        self._watchdog = Watchdog(self._link.send_unlocked, self.config.watchdog_s)
+        self._watchdog = Watchdog(self._link.send_unlocked, self.config.watchdog_s, self._link.hand_over)
+        self._guardian: GuardianProcess | None = None
         self.controller = OrbitController(self._link, self.config, self._watchdog)
         self._states = self.output("vehicle/state")
         self._statuses = self.output("orbit/status")
@@ -110,6 +112,9 @@ class MavlinkBridgeNode(ComponentNode):
         for thread in self._threads:
             thread.start()
         self._watchdog.start()
+        if self.config.commands_enabled:
+            self._guardian = GuardianProcess(self.config.watchdog_s)
+            self._link.guardian = self._guardian.take
 
     def on_stop(self) -> None:
         """End a running orbit by a hold at once, before the shutdown waits for other nodes."""
@@ -130,6 +135,8 @@ class MavlinkBridgeNode(ComponentNode):
                 thread.join(timeout=5.0)
         self._watchdog.close()
         self.requests.close()
+        if self._guardian is not None:
+            self._guardian.close()
         self._link.close()
 
     def _control(self) -> None:

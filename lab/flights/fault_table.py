@@ -101,6 +101,7 @@ _LOSE_SUBJECT = assign(perceive=lambda seen: None)
 _DENY_HOLD = assign("copter", denied_modes=frozenset({"BRAKE", "LOITER"}))
 _DENY_CONTROL = assign("copter", denied_modes=frozenset({"GUIDED", "OFFBOARD"}))
 _TO_CONTROL, _TO_POSITION = pilot("GUIDED", "OFFBOARD"), pilot("LOITER", "POSCTL")
+_STOPPED, _CONTINUES = assign(stopped=True), (3.0, assign(stopped=False))
 _STOP, _ENGAGE = command(Command.STOP), command(Command.ENGAGE)
 
 
@@ -108,9 +109,9 @@ def _perception(name: str, inject: Injection, code: ConditionCode = _C.SUBJECT_O
     return Fault(name, inject, FRAME_S, codes=(code,))
 
 
-def _process(name: str, **values: Any) -> Fault:
-    """The process stops: only the autopilot's time-out can end the motion."""
-    return Fault(name, assign(stopped=True), LINK_S, cause=TIMEOUT, **values)
+def _computer(name: str, **values: Any) -> Fault:
+    """It dies: only the autopilot's time-out can end the motion."""
+    return Fault(name, assign(stopped=True, dead=True), LINK_S, cause=TIMEOUT, **values)
 
 
 def _link(name: str, owner: str, fault: dict[str, Any], **values: Any) -> Fault:
@@ -150,12 +151,14 @@ _PERCEPTION = (
     Fault("every other image lost", lose_half, harmless=True),
 )
 _PROCESS = (
-    _process("process killed (SIGKILL)"),
-    _process("process killed, time-outs of 0.3 s", change=short_timeouts),
-    _process("process killed, time-outs as shipped", change=shipped_timeouts),
-    _process("process stopped for 3 s (SIGSTOP)", later=(3.0, assign(stopped=False)), codes=(_STALLED, *_TAKEN)),
-    _process("process restarts after 1 s", later=(1.0, restart), check=no_orbit, codes=_RESTARTED),
-    Fault("process restarts at once", restart, LINK_S, cause=TIMEOUT, check=no_orbit),
+    Fault("process killed (SIGKILL)", _STOPPED, LINK_S),
+    Fault("process killed, time-outs as shipped", _STOPPED, LINK_S, change=shipped_timeouts),
+    Fault("process stopped for 3 s (SIGSTOP)", _STOPPED, LINK_S, later=_CONTINUES, codes=(_STALLED, *_TAKEN)),
+    Fault("process restarts after 1 s", _STOPPED, LINK_S, later=(1.0, restart), check=no_orbit, codes=_RESTARTED),
+    Fault("process restarts at once", restart, LINK_S, check=no_orbit),
+    _computer("computer dies"),
+    _computer("computer dies, time-outs of 0.3 s", change=short_timeouts),
+    _computer("computer dies, time-outs as shipped", change=shipped_timeouts),
     Fault("control loop hangs", assign(hung=True)),
     Fault("control loop hangs for 1 s", assign(hung=True), later=(1.0, assign(hung=False)), codes=(_STALLED,)),
     Fault("clock jumps 3 s ahead", assign(clock_jump_s=3.0), LINK_S, codes=(_C.CLOCK_JUMPED,)),
@@ -289,10 +292,10 @@ _REAL = (
         "setpoints alone are lost for 2 s", drop_setpoints, LINK_S, cause=TIMEOUT,
         later=(2.0, assign("up", drops=lambda packet: False)),
     ),
-    _process("process killed in a wind of 8 m/s", change=in_wind),
+    _computer("computer dies in a wind of 8 m/s", change=in_wind),
     Fault(
-        "process stopped for 3 s, pilot takes RTL meanwhile", both(assign(stopped=True), pilot("RTL")), LINK_S,
-        cause=MODE, later=(3.0, assign(stopped=False)), check=kept("RTL"),
+        "process stopped for 3 s, pilot takes RTL meanwhile", both(_STOPPED, pilot("RTL")), LINK_S,
+        cause=MODE, later=_CONTINUES, check=kept("RTL"),
     ),
     Fault("downlink lost, then the pilot takes RTL", _CUT, LINK_S, later=(1.0, pilot("RTL")), check=kept("RTL")),
     Fault("downlink lost, then the pilot takes LAND", _CUT, LINK_S, later=(1.0, pilot("LAND")), check=kept("LAND")),

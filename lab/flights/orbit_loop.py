@@ -19,6 +19,7 @@ from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.mavlink.guardian import Guardian
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.orbit.control_status import ControlStatus
 from drocap_ros.flight.orbit.controller import OrbitController
@@ -132,6 +133,7 @@ class OrbitLoop:
 
     perceive : changes each observation before its delivery; None = lost
     hung : the control loop does not run;  stopped : link and watchdog do not run either (SIGSTOP, SIGKILL)
+    dead : the computer; with ``stopped``, nobody holds the vehicle
     clock_jump_s : added to the bridge's clock of the stamps
     status : of the last step of the controller
     """
@@ -139,7 +141,8 @@ class OrbitLoop:
     def __init__(self, settings: LoopSettings) -> None:
         settings = configured_mount(settings)
         self.settings, self.t = settings, 0.0
-        self.hung = self.stopped = False
+        self.hung = self.stopped = self.dead = False
+        self._guardians: list[Guardian] = []  # of each of the bridge's processes
         self.clock_jump_s = 0.0
         self.perceive: Callable[[PoseObservation], PoseObservation | None] = lambda seen: seen
         self.down, self.up = (Channel(lambda: self.t, settings.seed + i) for i in (1, 2))
@@ -180,7 +183,11 @@ class OrbitLoop:
         config = self.settings.config
         transport = LoopbackTransport(self.down, self.up)
         self.link = MavlinkLink(config, self.clock_ns, monotonic_s=lambda: self.t, transport=transport)
-        self.watchdog = Watchdog(self.link.send_unlocked, config.watchdog_s)
+        for guardian in self._guardians:
+            guardian.ended = True
+        self._guardians.append(guardian := Guardian(config.watchdog_s))
+        self.link.guardian = lambda packets, _: guardian.take(self.t, packets)
+        self.watchdog = Watchdog(self.link.send_unlocked, config.watchdog_s, self.link.hand_over)
         self.controller = OrbitController(self.link, config, self.watchdog)
         self.controller.on_camera(self.matrix)
 
@@ -245,6 +252,9 @@ class OrbitLoop:
                 for state in self.link.spin_once(0.0):
                     self.controller.on_state(state)
                 self.watchdog.step(self.t)
+            for guardian in [] if self.dead else self._guardians:
+                if (packet := guardian.due(self.t)) is not None:
+                    self.up.write(packet)
         if self.t < self._next_control - 1e-9:
             return
         self._next_control += 1.0 / self.settings.config.control_hz

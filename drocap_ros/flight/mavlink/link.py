@@ -18,10 +18,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.guardian import PACKETS
 from drocap_ros.flight.mavlink.message import Message
 from drocap_ros.flight.mavlink.messages import TELEMETRY_COMMANDS, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.mount import Mount
-from drocap_ros.flight.mavlink.parser import MavlinkParser, read_signing_key, sign_with, signing_time
+from drocap_ros.flight.mavlink.parser import MavlinkParser, Packer, read_signing_key
 from drocap_ros.flight.mavlink.settings import AutopilotSettings
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.mavlink.telemetry_request import LinkStatus, TelemetryRequests
@@ -71,13 +72,12 @@ class MavlinkLink:
         self._parser = MavlinkParser(key, clock_ns())
         self._requests = TelemetryRequests(config)
         self.settings = AutopilotSettings(mount_type=config.mount == "auto")
-        self._mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
-        # The watchdog packs with an encoder of its own and so shares nothing with a loop that hangs.  It signs as
-        # another stream, because signed packets of one stream must not go back in time.
-        self._watchdog_mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
-        if key is not None:
-            sign_with(self._mav, key, clock_ns())
-            sign_with(self._watchdog_mav, key, clock_ns(), link_id=1)
+        # The watchdog has its own and so shares nothing with a loop that hangs.
+        self._own, self._watchdog, self._guardian = (
+            Packer(config.system_id, config.component_id, key, clock_ns(), link_id) for link_id in range(3)
+        )
+        #: Takes the packets of each step that hold the vehicle, and the port, for the time after this process.
+        self.guardian: Callable[[list[bytes], Transport], None] | None = None
         self._autopilot: Autopilot | None = None  # None = none is heard yet
         self._heard_s: float | None = None  # monotonic
         self._due: dict[str, float] = {}
@@ -118,7 +118,7 @@ class MavlinkLink:
     @property
     def mav(self) -> mavlink.MAVLink:
         """Encoder of our own messages."""
-        return self._mav
+        return self._own.mav
 
     @property
     def target(self) -> tuple[int, int]:
@@ -160,9 +160,16 @@ class MavlinkLink:
         self.check_motion(message)
         self._note_stream(message)
         try:
-            self._transport.write(self._pack(message, self._watchdog_mav))
+            self._transport.write(self._pack(message, self._watchdog))
         except LinkError as error:
             logger.warning("the watchdog could not send: %s", error)
+
+    def hand_over(self, hold: Message | None) -> None:
+        """Give the guardian a motion message for the time after this process; None = nothing is commanded."""
+        if self.guardian is None:
+            return
+        packets = [] if hold is None else [self._pack(self.check_motion(hold), self._guardian) for _ in range(PACKETS)]
+        self.guardian(packets if self._broken_s is None else [], self._transport)
 
     def stream_gap_s(self) -> float:
         """Time in s since the last setpoint was sent; infinity before the first."""
@@ -280,7 +287,7 @@ class MavlinkLink:
 
     def _take_time_sync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request of the autopilot
-            self._send(self._mav.timesync_encode(now_ns, message.ts1))
+            self._send(self.mav.timesync_encode(now_ns, message.ts1))
             return
         sent_s = self._sync_sent.pop(message.ts1, None)
         if sent_s is not None:
@@ -291,7 +298,7 @@ class MavlinkLink:
         config = self.config
         if self._is_due("heartbeat", 1.0 / config.heartbeat_hz):
             self._send(
-                self._mav.heartbeat_encode(
+                self.mav.heartbeat_encode(
                     mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE
                 )
             )
@@ -302,17 +309,17 @@ class MavlinkLink:
             if len(self._sync_sent) > _PENDING_SYNCS:
                 self._sync_sent.clear()
             self._sync_sent[now_ns] = self._monotonic_s()
-            self._send(self._mav.timesync_encode(0, now_ns))
+            self._send(self.mav.timesync_encode(0, now_ns))
         system, component = self.estimator.system_id, self.estimator.component_id
         if self._is_due("request", _REQUEST_PERIOD_S):
             for number, interval_us in self._requests.due(now_ns):
                 self._send(
-                    self._mav.command_long_encode(
+                    self.mav.command_long_encode(
                         system, component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval_us, 0, 0, 0, 0, 0
                     )
                 )
         for setting in self.settings.due(self._monotonic_s()):
-            self._send(self._mav.param_request_read_encode(system, component, setting.encode("ascii"), -1))
+            self._send(self.mav.param_request_read_encode(system, component, setting.encode("ascii"), -1))
 
     def _is_due(self, what: str, period_s: float) -> bool:
         now = self._monotonic_s()
@@ -335,15 +342,9 @@ class MavlinkLink:
         if self._broken_s is not None:
             return
         try:
-            self._transport.write(self._pack(message, self._mav))
+            self._transport.write(self._pack(message, self._own))
         except LinkError as error:
             self._break(error)
 
-    def _pack(self, message: Message, mav: mavlink.MAVLink) -> bytes:
-        if mav.signing.sign_outgoing:
-            # Never backwards, whatever our clock does, and never far behind the time that others sign.
-            heard = self._parser.signing.timestamp
-            mav.signing.timestamp = max(mav.signing.timestamp, signing_time(self._clock_ns()), heard)
-        packet = bytes(message.pack(mav))
-        mav.seq = (mav.seq + 1) % 256
-        return packet
+    def _pack(self, message: Message, stream: Packer) -> bytes:
+        return stream.pack(message, self._clock_ns(), self._parser.signing.timestamp)

@@ -91,6 +91,33 @@ def sign_with(mav: mavlink.MAVLink, key: bytes, now_ns: int, link_id: int = 0) -
     mav.signing.timestamp = signing_time(now_ns)
 
 
+class Packer:
+    """Our messages as packets of one stream; with a key it signs them.
+
+    Signed packets of one stream must not go back in time, so whoever shares no lock with the others has its own.
+
+    Parameters
+    ----------
+    system, component : our ids
+    key : of 32 bytes
+    now_ns : our clock
+    link_id : of the stream
+    """
+
+    def __init__(self, system: int, component: int, key: bytes | None, now_ns: int, link_id: int) -> None:
+        self.mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        if key is not None:
+            sign_with(self.mav, key, now_ns, link_id)
+
+    def pack(self, message: Message, now_ns: int, heard: int) -> bytes:
+        """The packet; its signature is never earlier than the last one, nor than ``heard``, when others signed."""
+        signing = self.mav.signing
+        signing.timestamp = max(signing.timestamp, signing_time(now_ns), heard)
+        packet = bytes(message.pack(self.mav))
+        self.mav.seq = (self.mav.seq + 1) % 256
+        return packet
+
+
 class SigningMavlink(mavlink.MAVLink):
     """pymavlink's protocol object, except that a forged signature does not advance the time of its stream.
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import select
 import socket
-from typing import TYPE_CHECKING, Protocol
+import time
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from drocap_ros.errors import DrocapError, InputError
 
@@ -13,13 +15,21 @@ if TYPE_CHECKING:
     import serial
 
 URL_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE[:BAUD]"
+Address: TypeAlias = tuple[str | int | bytes, ...]  # of a datagram, as its family has it
 _MAX_DATAGRAM = 65535  # bytes of UDP
 _CONNECT_TIMEOUT_S = 3.0  # of TCP, on a local network
+_TAKEN = (errno.EADDRINUSE, errno.EAGAIN)  # of UDP, of the lock of a serial port
+#: The guardian of a bridge that died holds its port for 1.6 s at most; tried again so often.
+_HELD_S, _AGAIN_S = 2.0, 0.1
 _DEFAULT_BAUD = 57600  # of telemetry radios as shipped
 
 
 class LinkError(DrocapError):
     """The link to the autopilot broke."""
+
+
+class _TakenError(InputError):
+    """Another program holds the port."""
 
 
 class Transport(Protocol):
@@ -34,6 +44,9 @@ class Transport(Protocol):
     def accept_peer(self) -> None:
         """Send to the sender of the latest bytes from now on (listening UDP)."""
 
+    def port(self) -> tuple[int, Address | None]:
+        """Descriptor of the open port, and where its datagrams go; None = it is no port of datagrams."""
+
     def close(self) -> None:
         """Close the port."""
 
@@ -46,6 +59,17 @@ def open_transport(url: str) -> Transport:
     InputError
         When the URL cannot be understood, or its address, port or device cannot be used.
     """
+    last_s = time.monotonic() + _HELD_S
+    while True:
+        try:
+            return _open(url)
+        except _TakenError:
+            if time.monotonic() > last_s:
+                raise
+        time.sleep(_AGAIN_S)
+
+
+def _open(url: str) -> Transport:
     match = re.fullmatch(r"(udp|udpin|udpout|tcp|serial):(?://)?(.+)", url.strip())
     if match is None:
         raise InputError(f"url: expected {URL_FORMS}, got {url!r}; correct the parameter")
@@ -58,7 +82,7 @@ def open_transport(url: str) -> Transport:
             return _TcpTransport(host, port)
         return _UdpTransport(host, port, listen=kind != "udpout")
     except OSError as error:
-        raise InputError(
+        raise _refusal(error)(
             f"url: expected an address that can be opened, got {url!r}: {error.strerror or error}; "
             "check host and port, and that no other program holds them"
         ) from None
@@ -87,7 +111,12 @@ def _open_serial(rest: str, url: str) -> Transport:
         return _SerialTransport(serial.Serial(device, int(baud), timeout=0, write_timeout=0.2, exclusive=True))
     except (serial.SerialException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"url: expected a serial device that can be opened, got {url!r}: {reason}") from None
+        raise _refusal(error)(f"url: expected a serial device that can be opened, got {url!r}: {reason}") from None
+
+
+def _refusal(error: Exception) -> type[InputError]:
+    """What a port that cannot be opened is refused with."""
+    return _TakenError if getattr(error, "errno", None) in _TAKEN else InputError
 
 
 class _UdpTransport:
@@ -127,6 +156,9 @@ class _UdpTransport:
         if not self._fixed_peer and self._sender is not None:
             self._peer = self._sender
 
+    def port(self) -> tuple[int, Address | None]:
+        return self._socket.fileno(), self._peer
+
     def close(self) -> None:
         self._socket.close()
 
@@ -162,6 +194,9 @@ class _TcpTransport:
     def accept_peer(self) -> None:
         """Do nothing: there is one peer."""
 
+    def port(self) -> tuple[int, None]:
+        return self._socket.fileno(), None
+
     def close(self) -> None:
         self._socket.close()
 
@@ -189,6 +224,9 @@ class _SerialTransport:
 
     def accept_peer(self) -> None:
         """Do nothing: there is one peer."""
+
+    def port(self) -> tuple[int, None]:
+        return self._port.fileno(), None
 
     def close(self) -> None:
         self._port.close()

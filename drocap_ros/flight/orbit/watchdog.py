@@ -35,10 +35,16 @@ class Watchdog:
     ----------
     send : sends a message without waiting for any lock
     limit_s : time without :meth:`kick`
+    hand_over : gives the hold of each step to the guardian, which outlives this process
     """
 
-    def __init__(self, send: Callable[[Message], None], limit_s: float) -> None:
-        self._send, self._limit_s = send, limit_s
+    def __init__(
+        self,
+        send: Callable[[Message], None],
+        limit_s: float,
+        hand_over: Callable[[Message | None], None] = lambda _: None,
+    ) -> None:
+        self._send, self._limit_s, self._hand_over = send, limit_s, hand_over
         self._latest: tuple[float, FallbackCommands | None] = (-1e18, None)  # replaced whole: no lock
         self._sent_s = self._checked_s = -1e18
         self._stood_s = 0.0  # how long this thread itself stood still since the last step of the loop
@@ -50,6 +56,7 @@ class Watchdog:
     def kick(self, now_s: float, commands: FallbackCommands | None) -> None:
         """Note a step of the loop; ``commands`` is None while nothing is commanded."""
         self._latest, self._stood_s = (now_s, commands), 0.0
+        self._hand_over(commands.hold if commands else None)
 
     def step(self, now_s: float) -> None:
         """Check the loop and act."""

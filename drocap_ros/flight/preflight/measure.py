@@ -87,7 +87,7 @@ class ListeningLink(MavlinkLink):
             self._version_tries += 1
             number = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
             request = mavlink.MAV_CMD_REQUEST_MESSAGE
-            self._send(self._mav.command_long_encode(*self.target, request, 0, number, 0, 0, 0, 0, 0, 0))
+            self._send(self.mav.command_long_encode(*self.target, request, 0, number, 0, 0, 0, 0, 0, 0))
 
 
 class Listening:

@@ -70,8 +70,11 @@ class LoopbackTransport:
         self._outgoing.write(data)
         return True
 
-    def accept_peer(self) -> None:
-        """Do nothing: there is one peer."""
+    def port(self) -> tuple[int, None]:
+        """None: nothing is open."""
+        return -1, None
 
     def close(self) -> None:
         """Do nothing."""
+
+    accept_peer = close  # there is one peer

@@ -1,0 +1,164 @@
+"""Holds the vehicle where the bridge's process dies or stands still: a process of its own that shares the open port.
+
+In each step of an orbit the bridge hands over the packets that hold the vehicle where it is, and the port.  The
+guardian sends them, one after the other, when that process has ended, or has been silent for a time.  It requests no
+mode and reads nothing: an autopilot in another mode ignores the packets.  It then gives up the port and ends.
+
+This file is its program too.  It imports nothing but the standard library: what fails there fails in no other place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drocap_ros.flight.mavlink.transport import Transport
+
+#: Packets of a hold, and s between them: two within the autopilot's time-out of 0.5 s, for 1.4 s and that time-out.  A
+#: vehicle stands by then: it brakes at 1.3 m/s^2 and more, from 2.3 m/s at most (``max_coast_m``).
+PACKETS, PERIOD_S = 8, 0.2
+_CHECK_S = 0.02  # as the watchdog's
+_STOOD_S = 0.5  # for which the guardian stood too: the autopilot's time-out has ended the motion
+_LONGEST_ORDER = 16384  # bytes: eight signed packets of 73 in digits are 1.3 kB
+_ENDS_S = 1.0  # until an idle one has ended
+
+logger = logging.getLogger(__name__)
+
+
+class Guardian:
+    """What was handed over last, and when it is sent.  It reads no clock.
+
+    Parameters
+    ----------
+    limit_s : silence of the bridge
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+        self._packets: list[bytes] = []
+        self._heard_s = self._checked_s = self._sent_s = -1e18
+        self.ended = False  # the bridge's process
+
+    @property
+    def done(self) -> bool:
+        """Whether the bridge has ended, and nothing is left to be sent."""
+        return self.ended and not self._packets
+
+    def take(self, now_s: float, packets: Sequence[bytes]) -> None:
+        """Take what the bridge hands over; nothing: it commands nothing."""
+        self._heard_s, self._packets = now_s, list(packets)
+
+    def due(self, now_s: float) -> bytes | None:
+        """The packet to send now."""
+        gap_s, self._checked_s = now_s - self._checked_s, now_s
+        if gap_s > _STOOD_S:
+            self._packets = []  # of another place than the present one
+        silent = self.ended or now_s - self._heard_s > self._limit_s
+        if not (silent and self._packets and now_s - self._sent_s >= PERIOD_S):
+            return None
+        self._sent_s = now_s
+        return self._packets.pop(0)
+
+
+class GuardianProcess:
+    """The guardian's process, seen from the bridge.
+
+    Parameters
+    ----------
+    limit_s : silence of the bridge, after which it acts
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._channel, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._channel.setblocking(False)
+        with channel:
+            # In a session of its own, so that what ends the bridge's group does not end it.
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", __file__, str(channel.fileno()), str(limit_s)],
+                pass_fds=(channel.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        self._armed = self._lost = False
+
+    def take(self, packets: Sequence[bytes], transport: Transport) -> None:
+        """Hand over packets and the port of the transport; it never waits, and never raises."""
+        if not packets and not self._armed:
+            return
+        descriptor, peer = transport.port()
+        order = json.dumps({"peer": peer, "packets": [packet.hex() for packet in packets]}).encode()
+        try:
+            socket.send_fds(self._channel, [order], [descriptor] if packets else [])
+        except OSError as error:
+            if not self._lost:
+                logger.warning("the guardian of the link does not answer (%s): it holds nothing", error)
+            self._lost = True
+            return
+        self._armed, self._lost = bool(packets), False
+
+    def close(self) -> None:
+        """Let it end; what it would have to send is sent by nobody."""
+        with contextlib.suppress(OSError):
+            self._channel.send(json.dumps({"peer": None, "packets": []}).encode())
+        self._channel.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_ENDS_S)
+
+
+class _Port:
+    """The bridge's open port, shared."""
+
+    def __init__(self) -> None:
+        self._descriptor: int | None = None
+        self._peer: tuple[str, int] | None = None
+
+    def take(self, descriptors: Sequence[int], peer: Sequence[str | int] | None) -> None:
+        """Take a port instead of the one before; without one, none is held open."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+        self._descriptor = descriptors[0] if descriptors else None
+        self._peer = None if peer is None else tuple(peer)  # type: ignore[assignment]  # as the bridge has it
+
+    def write(self, packet: bytes) -> None:
+        """Send; what the port refuses is lost."""
+        if self._descriptor is None:
+            return
+        with contextlib.suppress(OSError):
+            if self._peer is None:
+                os.write(self._descriptor, packet)
+                return
+            with socket.socket(fileno=os.dup(self._descriptor)) as shared:
+                shared.sendto(packet, self._peer)
+
+
+def main(channel: socket.socket, limit_s: float) -> None:
+    """Take what the bridge hands over, until its process ends; then hold, where it has commanded motion."""
+    guardian, port = Guardian(limit_s), _Port()
+    while not guardian.done:
+        if guardian.ended:
+            time.sleep(_CHECK_S)
+        elif select.select([channel], [], [], _CHECK_S)[0]:
+            data, descriptors, *_ = socket.recv_fds(channel, _LONGEST_ORDER, 1)
+            guardian.ended = not data
+            if data:
+                order = json.loads(data)
+                port.take(descriptors, order["peer"])
+                guardian.take(time.monotonic(), [bytes.fromhex(packet) for packet in order["packets"]])
+        if (packet := guardian.due(time.monotonic())) is not None:
+            port.write(packet)
+
+
+if __name__ == "__main__":
+    main(socket.socket(fileno=int(sys.argv[1])), float(sys.argv[2]))

@@ -1,0 +1,134 @@
+"""What holds the vehicle after the bridge's process has ended."""
+
+import itertools
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from drocap_ros.flight.mavlink.guardian import PACKETS, PERIOD_S, Guardian, GuardianProcess
+from drocap_ros.flight.mavlink.transport import open_transport
+
+#: A bridge that hands over its hold, and ends as its last argument says.
+_BRIDGE = """
+import os, signal, sys, time
+from drocap_ros.flight.mavlink.guardian import GuardianProcess
+from drocap_ros.flight.mavlink.transport import open_transport
+
+transport = open_transport(sys.argv[1])
+transport.write(b"orbit")
+guardian = GuardianProcess(0.2)
+for i in range(20):
+    guardian.take([b"hold %d %d" % (i, n) for n in range(8)], transport)
+    time.sleep(0.02)
+if sys.argv[2] == "idle":
+    guardian.take([], transport)
+    sys.argv[2] = "SIGKILL"
+if sys.argv[2] == "close":
+    guardian.close()
+else:
+    os.kill(os.getpid(), getattr(signal, sys.argv[2]))
+"""
+_STEP_S = 0.02
+
+
+def sent(guardian, from_s, to_s):
+    """(times, packets) that are due between, looked for as the process does."""
+    steps = [from_s + _STEP_S * i for i in range(round((to_s - from_s) / _STEP_S))]
+    found = [(t, packet) for t in steps if (packet := guardian.due(t)) is not None]
+    return [t for t, _ in found], [packet for _, packet in found]
+
+
+HOLD = [bytes([i]) for i in range(PACKETS)]
+
+
+@pytest.mark.parametrize(("ended", "after_s"), [(True, 0.0), (False, 0.2)])
+def test_packets_are_sent_once_the_bridge_has_ended_or_is_silent(ended, after_s):
+    guardian = Guardian(0.2)
+    for i in range(20):
+        guardian.take(0.05 * i, HOLD)
+        assert sent(guardian, 0.05 * i, 0.05 * i + 0.04) == ([], [])
+    guardian.ended = ended
+    times, packets = sent(guardian, 1.0, 6.0)
+    assert packets == HOLD
+    assert times[0] == pytest.approx(max(1.0, 0.95 + after_s), abs=2 * _STEP_S)
+    assert max(b - a for a, b in itertools.pairwise(times)) < PERIOD_S + 1.5 * _STEP_S
+    assert guardian.done is ended
+
+
+@pytest.mark.parametrize("packets", [HOLD, []], ids=["orbit", "idle"])
+def test_nothing_is_sent_by_one_that_stood_still_itself_or_where_nothing_was_commanded(packets):
+    guardian = Guardian(0.2)
+    guardian.due(0.98)
+    guardian.take(1.0, packets)
+    assert sent(guardian, 1.0 if not packets else 3.0, 6.0) == ([], [])
+    guardian.take(6.0, HOLD)
+    assert sent(guardian, 6.0, 8.0)[1] == HOLD  # the next step of an orbit arms it again
+
+
+@pytest.fixture
+def vehicle():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        port.bind(("127.0.0.1", 0))
+        port.settimeout(20.0)
+        yield port
+
+
+def heard(vehicle, quiet_s):
+    """(packet, sender) until nothing has come for so long."""
+    found = [vehicle.recvfrom(100)]
+    while select.select([vehicle], [], [], quiet_s)[0]:
+        found.append(vehicle.recvfrom(100))
+    return found
+
+
+def bridge(vehicle, end):
+    return subprocess.Popen([sys.executable, "-c", _BRIDGE, f"udpout:127.0.0.1:{vehicle.getsockname()[1]}", end])
+
+
+def test_a_killed_bridge_holds_by_its_own_port_and_gives_it_up(vehicle):
+    with bridge(vehicle, "SIGKILL"):
+        found = heard(vehicle, 3.0)
+    packets, senders = zip(*found, strict=True)
+    assert packets == (b"orbit", *(b"hold 19 %d" % n for n in range(PACKETS)))
+    assert len(set(senders)) == 1  # the autopilot answers to the port that it knows
+    open_transport(f"udpin:0.0.0.0:{senders[0][1]}").close()
+
+
+def test_a_bridge_that_starts_at_once_waits_for_the_port(vehicle):
+    with bridge(vehicle, "SIGKILL"):
+        packets = [vehicle.recvfrom(100) for _ in range(2)]  # the guardian has begun
+    open_transport(f"udpin:0.0.0.0:{packets[0][1][1]}").close()
+
+
+def test_a_stopped_bridge_holds(vehicle):
+    with bridge(vehicle, "SIGSTOP") as process:
+        packets = [packet for packet, _ in heard(vehicle, 3.0)]
+        os.kill(process.pid, signal.SIGKILL)
+    assert packets == [b"orbit", *(b"hold 19 %d" % n for n in range(PACKETS))]
+    assert not select.select([vehicle], [], [], 1.0)[0]
+
+
+@pytest.mark.parametrize("end", ["idle", "close"])
+def test_a_bridge_that_commands_nothing_ends_without_a_word(vehicle, end):
+    with bridge(vehicle, end):
+        assert [packet for packet, _ in heard(vehicle, 2.0)] == [b"orbit"]
+
+
+def test_a_port_without_datagrams_is_shared_too():
+    read, write = os.pipe()
+    guardian = GuardianProcess(0.2)
+    for _ in range(50):  # until it has started
+        guardian.take([b"hold"], SimpleNamespace(port=lambda: (write, None)))
+        time.sleep(0.02)
+    assert select.select([read], [], [], 20.0)[0]
+    assert os.read(read, 100) == b"hold"
+    guardian.close()
+    os.close(read)
+    os.close(write)
