@@ -19,7 +19,10 @@ _MOST = 160  # points at a time, and cells of the grid: ten times the least numb
 _ENOUGH = 80  # of them: with fewer, cells take more than one
 _IN_A_CELL = 3  # most that one takes, and that may gather there as the camera backs off
 _GRADIENT = 2.5  # grey values per px along an edge's own direction, root mean square: sky, water and walls have less
+_FAINT = 1.0  # the same where an image has too few of these: concrete and snow have it, noise of pictures half of it
 _BLOCK_PX = 5  # over which that is measured, in the image at half the size
+#: Least gradient of a corner, and points of its cell with it: in this order, until there are enough.
+_SEARCHES = ((_GRADIENT, 1), (_FAINT, 1), (_GRADIENT, 2), (_GRADIENT, _IN_A_CELL))
 _EDGE_PX = 10  # of the image, in which a patch would not fit
 _WINDOW_PX = 11  # of the optical flow around each point, in the image at half the size
 _COARSEST_PX = 16  # least height or width of the flow's coarsest image: its window has to fit
@@ -189,11 +192,11 @@ def _shift(last: np.ndarray, grey: np.ndarray) -> np.ndarray:
 def _corners(grey: np.ndarray, persons: Sequence[np.ndarray], points: np.ndarray) -> np.ndarray:
     """(N, 2) float32 px, the best corners of the cells of the grid without a point, not more than there is room for.
 
-    Where little of the image has texture, its cells take more than one.  None lies on persons, boxes (4,) px.
+    Where little of the image has texture, faint corners count, then cells take more than one.  None lies on persons,
+    boxes (4,) px.
     """
     half = _half(grey)
-    # OpenCV's scale: four times the mean square of the gradient, grey values from 0 to 1.
-    response = cv2.cornerMinEigenVal(half, _BLOCK_PX) - 4 * (_GRADIENT / 255) ** 2
+    response = cv2.cornerMinEigenVal(half, _BLOCK_PX)
     edge = _EDGE_PX // 2 + 1
     response[:edge], response[-edge:], response[:, :edge], response[:, -edge:] = 0, 0, 0, 0
     for box in persons:
@@ -202,9 +205,10 @@ def _corners(grey: np.ndarray, persons: Sequence[np.ndarray], points: np.ndarray
     there = _halved(points)
     found = there
     _take(response, there)
-    for most in range(1, _IN_A_CELL + 1):
-        if len(found) < (_MOST if most == 1 else _ENOUGH):
-            new = _best(response, found, most)
+    for least, most in _SEARCHES:
+        if len(found) < (_MOST if (least, most) == _SEARCHES[0] else _ENOUGH):
+            # OpenCV's scale: four times the mean square of the gradient, grey values from 0 to 1.
+            new = _best(response - 4 * (least / 255) ** 2, found, most)
             _take(response, new)
             found = np.concatenate([found, new])
     return _doubled(found[len(there) :])

@@ -16,6 +16,7 @@ from drocap_ros.reconstruction.camera.growth import (
     candidate_pairs,
     small_motion,
     turns,
+    with_ends,
 )
 from drocap_ros.reconstruction.camera.kinds import Kind, kind_of, turning_focal
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
@@ -126,7 +127,7 @@ def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: flo
         if small is None or grown.residual_px <= small.residual_px:
             return grown
     of_path = replace(camera, rotation=small.rotation, position=small.position)
-    return _checked(of_path, small, 1.0)
+    return _checked(of_path, small)
 
 
 def _small_motion(sightings: Sightings, camera: PictureCamera, fps: float, enough_px: float) -> AdjustedPath | None:
@@ -144,15 +145,11 @@ def _small_motion(sightings: Sightings, camera: PictureCamera, fps: float, enoug
 def _grown(sightings: Sightings, camera: PictureCamera, start: Growth, fps: float) -> PictureCamera:
     """The path that grows from a start over all keyframes that can be placed."""
     path = start.grow(len(sightings))
-    found = adjusted(sightings, path, fps, camera.focal_std, LAST_STEPS)
+    found = adjusted(sightings, with_ends(sightings, path), fps, camera.focal_std, LAST_STEPS)
     if found is None or path.known.mean() < _LEAST_KNOWN:
         return replace(camera, kind=Kind.FEW_POINTS, residual_px=float("inf"))
-    known = np.flatnonzero(path.known)
-    begin_at, end = int(sightings.frames[known[0]]), int(sightings.frames[known[-1]]) + 1
-    frames = len(camera.rotation)
-    ends = np.clip(np.arange(frames), begin_at, end - 1) - begin_at
-    of_path = replace(camera, rotation=found.rotation[ends], position=found.position[ends], matrix=path.matrix)
-    return _checked(of_path, found, (end - begin_at) / frames)
+    of_path = replace(camera, rotation=found.rotation, position=found.position, matrix=path.matrix)
+    return _checked(of_path, found)
 
 
 def _starts(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> list[tuple[float, Growth]]:
@@ -188,10 +185,10 @@ def _turning(sightings: Sightings, camera: PictureCamera, fps: float) -> Picture
     if found is None:
         return replace(camera, kind=Kind.FEW_POINTS)
     of_path = replace(camera, rotation=found.rotation, position=place)
-    return _checked(of_path, found, 1.0)
+    return _checked(of_path, found)
 
 
-def _checked(camera: PictureCamera, found: AdjustedPath, share: float) -> PictureCamera:
+def _checked(camera: PictureCamera, found: AdjustedPath) -> PictureCamera:
     """The camera with what its adjustment tells, and whether it fits."""
     focal = float(np.exp(found.shared[FOCAL]))
     steps = None if found.posterior is None else np.sqrt(np.diagonal(found.posterior.steps, axis1=1, axis2=2))
@@ -202,7 +199,7 @@ def _checked(camera: PictureCamera, found: AdjustedPath, share: float) -> Pictur
         focal_std=float(np.hypot(found.shared_std[FOCAL], _LASTING_FOCAL_STD)) if camera.focal_std else 0.0,
         points=found.points,
         residual_px=found.residual_px,
-        covered=share * found.covered,
+        covered=found.covered,
         position_std=float("nan") if steps is None else float(np.median(steps[:, :3])),
         turn_std_deg=float("nan") if steps is None else float(np.degrees(np.median(steps[:, 3:]))),
     )

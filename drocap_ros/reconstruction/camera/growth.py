@@ -238,15 +238,34 @@ class Growth:
         return found
 
 
+def with_ends(sightings: Sightings, path: Grown) -> Grown:
+    """The path with the keyframes before and behind the known ones: turned as the points say, at the nearest place.
+
+    Points that a hovering camera sees have no depth and place nothing; an adjustment finds the little that it moves.
+    """
+    known = np.flatnonzero(path.known)
+    rotation, position, filled = path.rotation.copy(), path.position.copy(), path.known.copy()
+    ends = [(key, key + 1) for key in range(int(known[0]) - 1, -1, -1)]
+    ends += [(key, key - 1) for key in range(int(known[-1]) + 1, len(sightings))]
+    for key, near in ends:
+        rotation[key] = _turned(sightings, near, key, path.matrix) @ rotation[near]
+        position[key], filled[key] = position[near], True
+    return replace(path, rotation=rotation, position=position, known=filled)
+
+
+def _turned(sightings: Sightings, first: int, second: int, matrix: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) from one keyframe to another by their common points; none where there are too few."""
+    both = sightings.common(first, second)
+    if len(both.piece) < 3:
+        return np.eye(3)
+    return turn_between(rays(both.first, matrix), rays(both.second, matrix))[0]
+
+
 def turns(sightings: Sightings, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations (F, 3, 3) from keyframe to keyframe, as if the camera kept its place, and zero positions (F, 3)."""
     rotation = np.tile(np.eye(3), (len(sightings), 1, 1))
     for key in range(1, len(sightings)):
-        both = sightings.common(key - 1, key)
-        step = np.eye(3)
-        if len(both.piece) >= 3:
-            step = turn_between(rays(both.first, matrix), rays(both.second, matrix))[0]
-        rotation[key] = step @ rotation[key - 1]
+        rotation[key] = _turned(sightings, key - 1, key, matrix) @ rotation[key - 1]
     return between(sightings.frames, rotation, np.zeros((len(sightings), 3)))
 
 
