@@ -22,7 +22,7 @@ _GRADIENT = 2.5  # grey values per px along an edge's own direction, root mean s
 _FAINT = 1.0  # the same where an image has too few of these: concrete and snow have it, noise of pictures half of it
 _BLOCK_PX = 5  # over which that is measured, in the image at half the size
 #: Least gradient of a corner, and points of its cell with it: in this order, until there are enough.
-_SEARCHES = ((_GRADIENT, 1), (_FAINT, 1), (_GRADIENT, 2), (_GRADIENT, _IN_A_CELL))
+_SEARCHES = (*((_GRADIENT, most) for most in range(1, _IN_A_CELL + 1)), (_FAINT, 1))
 _EDGE_PX = 10  # of the image, in which a patch would not fit
 _WINDOW_PX = 11  # of the optical flow around each point, in the image at half the size
 _COARSEST_PX = 16  # least height or width of the flow's coarsest image: its window has to fit
@@ -192,8 +192,8 @@ def _shift(last: np.ndarray, grey: np.ndarray) -> np.ndarray:
 def _corners(grey: np.ndarray, persons: Sequence[np.ndarray], points: np.ndarray) -> np.ndarray:
     """(N, 2) float32 px, the best corners of the cells of the grid without a point, not more than there is room for.
 
-    Where little of the image has texture, faint corners count, then cells take more than one.  None lies on persons,
-    boxes (4,) px.
+    Where little of the image has texture, its cells take more than one, then faint corners count.  None lies on
+    persons, boxes (4,) px.
     """
     half = _half(grey)
     response = cv2.cornerMinEigenVal(half, _BLOCK_PX)

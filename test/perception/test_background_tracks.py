@@ -63,6 +63,17 @@ def test_points_stay_where_they_are_in_the_scene(ground, scale):
     assert np.quantile(drift, 0.9) < 0.3 * scale
 
 
+def test_faint_ground_with_little_else_is_followed(ground):
+    faint = cv2.GaussianBlur(ground, (0, 0), 1.5).astype(np.float32)
+    faint = np.clip(np.round(120 + 0.35 * (faint - 120)), 0, 255).astype(np.uint8)
+    seen = followed(view(faint, i) for i in range(10))
+    first, last = seen[0], seen[-1]
+    both, i, j = np.intersect1d(first.track, last.track, return_indices=True)
+    assert len(first) >= 80
+    assert len(both) > 0.4 * len(first)
+    assert np.median(np.linalg.norm(on_ground(last.point[j], 9) - on_ground(first.point[i], 0), axis=1)) < 0.3
+
+
 def test_points_are_spread_over_the_image_and_their_number_is_bounded(ground):
     seen = followed(view(ground, i) for i in range(8))
     for points in seen:
