@@ -25,31 +25,26 @@ def band_factor(band: np.ndarray) -> np.ndarray | None:
 
 
 def forward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(N, K) solution of factor times solution = right, in double precision whatever that of the factor.
-
-    Of a column only the rows count from its first element that is not 0 to where the solution has died away.
-    """
+    """(N, K) solution of factor times solution = right, in double precision whatever that of the factor."""
     from scipy.linalg import get_blas_funcs
 
     if len(factor) <= _NARROW or right.shape[1] <= _FEW:
         return _whole(factor, right, "N")
     multiply, solve = get_blas_funcs(("trmm", "trsm"), (factor,))
     flat, reach = factor.T.reshape(-1), len(factor) - 1
-    there = right != 0.0
-    start, stop = there.argmax(axis=0), len(right) - there[::-1].argmax(axis=0)
-    out = np.zeros(right.shape, factor.dtype)
-    peak, alive = np.zeros(right.shape[1]), np.zeros(right.shape[1], bool)
-    for begin, end in _blocks(factor):
-        which = np.flatnonzero((start < end) & ((stop > begin) | alive))
-        part = np.array(right[begin:end, which], factor.dtype, order="F")
+    out = np.array(right, factor.dtype, order="C")
+    peak = np.zeros(right.shape[1], factor.dtype)
+    for begin in range(0, len(out), reach):
+        rows = out[begin : begin + reach]
         if begin:
-            before = np.array(out[begin - reach : begin, which], order="F")
-            part -= multiply(1.0, _coupling(flat, reach, begin), before)[: len(part)]
-        part = solve(1.0, _triangle(flat, reach, begin, end), part, lower=1, overwrite_b=1)
-        out[begin:end, which] = part
-        size = np.abs(part).max(axis=0, initial=0.0)
-        peak[which] = np.maximum(peak[which], size)
-        alive[which] = size > _DIED * peak[which]
+            rows -= multiply(1.0, _coupling(flat, reach, begin), out[begin - reach : begin].T, side=1, trans_a=1).T[
+                : len(rows)
+            ]
+        # Rows of NumPy's are columns of BLAS: transposed, they are solved in their place.
+        solve(1.0, _triangle(flat, reach, begin, len(rows)), rows.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+        size = np.abs(rows).max(axis=0)
+        peak = np.maximum(peak, size)
+        rows *= size > _DIED * peak
     return out.astype(np.float64, copy=False)
 
 
@@ -61,15 +56,15 @@ def backward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
         return _whole(factor, right, "T")
     multiply, solve = get_blas_funcs(("trmm", "trsm"), (factor,))
     flat, reach = factor.T.reshape(-1), len(factor) - 1
-    out = np.empty(right.shape, factor.dtype)
-    for begin, end in reversed(_blocks(factor)):
-        part = np.array(right[begin:end], factor.dtype, order="F")
+    out = np.zeros((len(right) + reach, right.shape[1]), factor.dtype)  # the last block has nothing after it
+    out[: len(right)] = right
+    for begin in reversed(range(0, len(right), reach)):
+        end = min(begin + reach, len(right))
+        rows = out[begin:end]
         if end < len(right):
-            after = np.zeros((reach, right.shape[1]), factor.dtype, order="F")
-            after[: len(right) - end] = out[end : end + reach]
-            part -= multiply(1.0, _coupling(flat, reach, end), after, trans_a=1)
-        out[begin:end] = solve(1.0, _triangle(flat, reach, begin, end), part, lower=1, trans_a=1, overwrite_b=1)
-    return out.astype(np.float64, copy=False)
+            rows -= multiply(1.0, _coupling(flat, reach, end), out[end : end + reach].T, side=1).T
+        solve(1.0, _triangle(flat, reach, begin, end - begin), rows.T, side=1, lower=1, overwrite_b=1)
+    return out[: len(right)].astype(np.float64, copy=False)
 
 
 def _whole(factor: np.ndarray, right: np.ndarray, trans: str) -> np.ndarray:
@@ -81,17 +76,12 @@ def _whole(factor: np.ndarray, right: np.ndarray, trans: str) -> np.ndarray:
     return np.asarray(found, np.float64)
 
 
-def _blocks(factor: np.ndarray) -> list[tuple[int, int]]:
-    """Ranges of unknowns: in blocks one narrower than the band, triangles lie in its memory as LAPACK's matrices do."""
-    width, size = factor.shape
-    return [(begin, min(begin + width - 1, size)) for begin in range(0, size, width - 1)]
-
-
-def _triangle(flat: np.ndarray, reach: int, begin: int, end: int) -> np.ndarray:
+def _triangle(flat: np.ndarray, reach: int, begin: int, size: int) -> np.ndarray:
     """Lower triangle (B, B) of the factor at these unknowns; what lies above it is of other unknowns."""
-    # In the band's memory, row i of column j is element i + (W - 1) j.
-    steps = (flat.itemsize, flat.itemsize * reach)
-    return as_strided(flat[begin * (reach + 1) :], (end - begin, end - begin), steps, writeable=False)
+    # In blocks one narrower than the band, triangles lie in its memory as LAPACK's matrices do: element [i, j] is
+    # i + (W - 1) j, where that is below the diagonal.
+    place = begin * (reach + 1)
+    return flat[place : place + reach * size].reshape((reach, size), order="F")[:size]
 
 
 def _coupling(flat: np.ndarray, reach: int, begin: int) -> np.ndarray:

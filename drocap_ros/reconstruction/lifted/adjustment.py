@@ -258,8 +258,9 @@ def _descend(p: AdjustmentProblem, here: _Residuals) -> _Residuals | None:
         return None
     # Eliminate the joints: half of a solve for every column, the other half for the answer alone.
     y = forward(factor, np.concatenate([-by_joints.reshape(-1, 1), border], axis=1))
-    schur = corner + np.diag(_DAMPING * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
-    sizes = np.linalg.solve(schur, -by_sizes - y[:, 1:].T @ y[:, 0])
+    square = y.T @ y
+    schur = corner + np.diag(_DAMPING * np.diag(corner)) - square[1:, 1:]
+    sizes = np.linalg.solve(schur, -by_sizes - square[1:, 0])
     joints = backward(factor, y[:, :1] - y[:, 1:] @ sizes[:, None]).reshape(by_joints.shape)
     lengths, zooms = sizes[: len(SPANS)], sizes[len(SPANS) :]
     slope = float((by_joints * joints).sum() + by_sizes @ sizes)

@@ -302,5 +302,6 @@ def _solve(
     if fixed:
         return backward(factor, forward(factor, -frames.reshape(-1, 1))).reshape(frames.shape), np.zeros(len(shared))
     y = forward(factor, np.concatenate([-frames.reshape(-1, 1), border], axis=1))
-    step = np.linalg.solve(corner - y[:, 1:].T @ y[:, 1:], -shared - y[:, 1:].T @ y[:, 0])
+    square = y.T @ y
+    step = np.linalg.solve(corner - square[1:, 1:], -shared - square[1:, 0])
     return backward(factor, y[:, :1] - y[:, 1:] @ step[:, None]).reshape(frames.shape), step

@@ -44,8 +44,8 @@ def normal_matrix(r: WorldResiduals) -> tuple[np.ndarray, np.ndarray, np.ndarray
     blocks = as_strided(band, (frames, FRAME, FRAME), (FRAME * WIDTH * step, (WIDTH - 1) * step, step))
     _set_image_part(r, blocks, border, corner)
     _add_body(r, blocks, border, corner)
-    # Elements below the diagonal lie here, in the rows before theirs.
-    band[:, :, FRAME:] = 0.0
+    # Elements below the diagonal, of the camera's block at most, lie here, in the rows before theirs.
+    band[:, :, 1 - CAMERA :] = 0.0
     _add_time(r, band)
     corner[:BONES, :BONES] += r.weights.body * GAUGE_M**-2
     prior = r.weights.shared.copy()
@@ -115,20 +115,24 @@ def _add_body(r: WorldResiduals, blocks: np.ndarray, border: np.ndarray, corner:
 
 def _add_time(r: WorldResiduals, band: np.ndarray) -> None:
     """Add the couplings between frames: accelerations, contacts, wander of the camera's errors."""
-    of_camera = (slice(0, 3), r.weights.camera_acceleration)
-    for rows, weight in ((slice(CAMERA, None), r.weights.acceleration), of_camera):
-        count = len(band) - 2
-        if count > 0:
-            for offset, factor in ((0, 1.0), (1, 4.0), (2, 1.0)):
-                band[offset : count + offset, rows, 0] += factor * weight
-            band[:count, rows, FRAME] -= 2 * weight
-            band[1:-1, rows, FRAME] -= 2 * weight
-            band[:count, rows, 2 * FRAME] += weight
+    # Of every unknown with itself, and with itself one frame on: the band's memory is passed once.
+    own, after = np.zeros((2, len(band), FRAME))
+    steady = np.full(FRAME, r.weights.acceleration)
+    steady[:CAMERA] = np.repeat([r.weights.camera_acceleration, 0.0], 3)
+    count = len(band) - 2
+    if count > 0:
+        for offset, factor in ((0, 1.0), (1, 4.0), (2, 1.0)):
+            own[offset : count + offset] += factor * steady
+        after[:count] -= 2 * steady
+        after[1:-1] -= 2 * steady
+        band[:count, :, 2 * FRAME] = steady
     for i, foot in enumerate(FEET):
         at = CAMERA + 3 * foot
-        band[:-1, at : at + 3, FRAME] -= r.step_weight[:, i, None]
-        band[:-1, at + 2, FRAME] += 0.25 * r.height_weight[:, i]
-    band[1:, :CAMERA, 0] += r.weights.wander
-    band[:-1, :CAMERA, 0] += r.weights.wander
-    band[:-1, :CAMERA, FRAME] -= r.weights.wander
-    band[0, :CAMERA, 0] += r.weights.first
+        after[:-1, at : at + 3] -= r.step_weight[:, i, None]
+        after[:-1, at + 2] += 0.25 * r.height_weight[:, i]
+    own[1:, :CAMERA] += r.weights.wander
+    own[:-1, :CAMERA] += r.weights.wander
+    after[:-1, :CAMERA] -= r.weights.wander
+    own[0, :CAMERA] += r.weights.first
+    band[:, :, 0] += own
+    band[:, :, FRAME] = after
