@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 
 #: Width of a band, and number of columns, up to which blocks are too small: calls would take longer than the sums.
 _NARROW, _FEW = 48, 4
@@ -37,9 +36,8 @@ def forward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
     for begin in range(0, len(out), reach):
         rows = out[begin : begin + reach]
         if begin:
-            rows -= multiply(1.0, _coupling(flat, reach, begin), out[begin - reach : begin].T, side=1, trans_a=1).T[
-                : len(rows)
-            ]
+            coupled = multiply(1.0, _coupling(flat, reach, begin), out[begin - reach : begin].T, side=1, trans_a=1)
+            rows -= coupled.T[: len(rows)]
         # Rows of NumPy's are columns of BLAS: transposed, they are solved in their place.
         solve(1.0, _triangle(flat, reach, begin, len(rows)), rows.T, side=1, lower=1, trans_a=1, overwrite_b=1)
         size = np.abs(rows).max(axis=0)
