@@ -11,15 +11,7 @@ import argparse
 from figures import table, write_figures
 
 from lab.flights.branches import over_processes
-from lab.flights.fault_flight import (
-    EXCURSION_M,
-    MOTION_S,
-    Fault,
-    FaultResult,
-    failures,
-    fly_fault,
-    within_protocol,
-)
+from lab.flights.fault_flight import EXCURSION_M, MOTION_S, Fault, FaultResult, failures, fly_fault, within_protocol
 from lab.flights.fault_table import FAULTS
 
 HEAD = [

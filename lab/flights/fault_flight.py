@@ -14,6 +14,7 @@ import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.orbit.states import Action, State
+from lab.flights.branches import branch
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 
 FAULT_S = 14.0
@@ -119,15 +120,23 @@ class Fault:
         return Bounds() if self.cause is None else self.cause.bounds(self.settings(autopilot), speed_m_s)
 
 
+_LED: dict[tuple[object, ...], OrbitLoop] = {}
+
+
 def fly_fault(fault: Fault, autopilot: str, seed: int = 4) -> FaultResult:
     """Lead the loop to the case's state, inject the fault at ``FAULT_S``, record for ``watch_s``.
+
+    The same flight leads to many cases: a process flies it once, and each case is a branch of it.
 
     Raises
     ------
     AssertionError
         When the loop is not in the case's state before the fault.
     """
-    return inject_fault(fault, lead_to_fault(fault, autopilot, seed))
+    flight = fault.settings(autopilot, seed), fault.before, fault.state
+    if flight not in _LED:
+        _LED[flight] = lead_to_fault(fault, autopilot, seed)
+    return branch(lambda: inject_fault(fault, _LED[flight]))
 
 
 def lead_to_fault(fault: Fault, autopilot: str, seed: int = 4) -> OrbitLoop:

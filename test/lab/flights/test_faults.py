@@ -1,12 +1,9 @@
 """Part of the table of faults; ``benchmarks/flight_faults.py`` flies all of it."""
 
-from functools import partial
-
 import pytest
 
 from drocap_ros.flight.orbit.states import State
-from lab.flights.branches import branch
-from lab.flights.fault_flight import failures, inject_fault, lead_to_fault, within_protocol
+from lab.flights.fault_flight import failures, fly_fault, within_protocol
 from lab.flights.fault_table import FAULTS
 
 SUBSET = {
@@ -35,17 +32,6 @@ SUBSET = {
     ("the ground is 2 m lower than configured", "ardupilot"),
     ("the ground is 2 m higher than configured", "px4"),
 }
-
-
-_LED = {}
-
-
-def fly_fault(fault, autopilot):
-    """Result of the case.  The same flight leads to many cases: it is flown once, and each case is a branch of it."""
-    flight = fault.settings(autopilot), fault.before, fault.state
-    if flight not in _LED:
-        _LED[flight] = lead_to_fault(fault, autopilot)
-    return branch(partial(inject_fault, fault, _LED[flight]))
 
 
 def fault_named(name):
