@@ -44,10 +44,8 @@ class FoundPerson:
         return dataclasses.replace(self, boxes=boxes) if boxes else None
 
 
-class PersonFinder:
-    """Finds the persons of a recording by five detections a second; they are numbered at the end.
-
-    A person that leaves the image and returns later counts as another one.
+class PersonSearch:
+    """Finds all persons of a stream by five detections a second.
 
     Raises
     ------
@@ -58,23 +56,38 @@ class PersonFinder:
     def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig) -> None:
         # Without a box of the drone the rule `roi` never chooses a subject: all persons are bystanders.
         self.estimator = PoseEstimator(models_dir, dataclasses.replace(config, subject="roi", subject_box=""))
-        self._least = config.confirm_frames
-        self._seen: dict[Person, dict[int, np.ndarray]] = {}
-        self._images = 0
         self._last_ns: int | None = None
 
     def due(self, stamp_ns: int) -> bool:
         """Whether the image of this time is one in which persons are sought."""
-        return self._last_ns is None or stamp_ns - self._last_ns >= _EVERY_NS - _JITTER_NS
+        last_ns = self._last_ns
+        return last_ns is None or stamp_ns < last_ns or stamp_ns - last_ns >= _EVERY_NS - _JITTER_NS
 
     def find(self, image: np.ndarray, stamp_ns: int) -> list[Person]:
         """Those detected in the next image that is due, (H, W, 3) uint8 BGR."""
         self._last_ns = stamp_ns
         self.estimator.process(image, stamp_ns)
-        self._images += 1
         # A track that clutter has taken over is a person's up to there.
         found = [p for p in self.estimator.tracker.persons if p.detected_ns == stamp_ns]
-        found = [person for person in found if person.mean_score >= _LEAST_SCORE]
+        return [person for person in found if person.mean_score >= _LEAST_SCORE]
+
+
+class PersonFinder(PersonSearch):
+    """Finds the persons of a recording, who are numbered at the end.
+
+    A person that leaves the image and returns later counts as another one.
+    """
+
+    def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig) -> None:
+        super().__init__(models_dir, config)
+        self._least = config.confirm_frames
+        self._seen: dict[Person, dict[int, np.ndarray]] = {}
+        self._images = 0
+
+    def find(self, image: np.ndarray, stamp_ns: int) -> list[Person]:
+        """Those detected in the next image that is due, (H, W, 3) uint8 BGR."""
+        found = super().find(image, stamp_ns)
+        self._images += 1
         for person in found:
             self._seen.setdefault(person, {})[stamp_ns] = person.box
         return found

@@ -25,10 +25,11 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.parameters import Parameters
 from drocap_ros.recording.session import Message
+from drocap_ros.ros import topics
 from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
 from drocap_ros.ros.rclpy_internals import MessageInfo, taking_info
-from drocap_ros.ros.topics import FROM_OUTSIDE, KEPT_QOS, RESULT_QOS, TOPICS, publishers_of, subscribers_of
+from drocap_ros.ros.topics import FROM_OUTSIDE, KEPT_QOS, RESULT_QOS, TOPICS
 from drocap_ros.stamps import StampValidator
 
 #: A simulated time that has not moved for this long, by the real clock, stands still: a busy simulator is faster.
@@ -76,6 +77,11 @@ class ComponentNode(Node):
     ) -> None:
         node_kwargs.setdefault("namespace", "/drocap")
         super().__init__(self.component, **node_kwargs)
+        name, own = topics.component_of(self.get_name())
+        #: Prefix of the topics of one person beside the subject: that of ``initializer_2`` is ``person_2/``.
+        self.person = own if name == self.component else ""
+        #: Name in the table of nodes.
+        self.entry = self.get_name() if self.person else self.component
         #: Whether ROS' parameter ``use_sim_time`` is set: every time is then that of ``/clock``, and no result depends
         #: on how fast this machine is.
         self.simulated = bool(self.get_parameter("use_sim_time").value)
@@ -84,8 +90,8 @@ class ComponentNode(Node):
         #: All nodes of the graph; empty without a bringup.
         self.peers: list[str] = [name for name in peers.split(",") if name]
         #: Nodes of the graph that one thread runs, by name: they read each other's parameters without a service.
-        self.beside: dict[str, ComponentNode] = {self.component: self}
-        self.config = declare_parameters(self, config or section_types()[self.component]())
+        self.beside: dict[str, ComponentNode] = {self.entry: self}
+        self.config = declare_parameters(self, config or section_types()[topics.section_of(self.component)]())
         self.transport = transport
         self.counters: Counter[str] = Counter()
         self._counting = threading.Lock()
@@ -148,6 +154,7 @@ class ComponentNode(Node):
 
     def output(self, topic: str) -> Publisher:
         """Publisher of a topic of the table."""
+        topic = topics.own_topic(self.person, topic)
         entry = TOPICS[topic]
         # The subscriber reports an incompatible quality of service itself.
         silent = PublisherEventCallbacks(use_default_callbacks=False)
@@ -169,6 +176,7 @@ class ComponentNode(Node):
 
         with_info : the callback's second argument is rclpy's message info
         """
+        topic = topics.own_topic(self.person, topic)
         entry = TOPICS[topic]
         take = self.guarded(topic, callback, stamps=entry.one_clock)
         if with_info:
@@ -268,9 +276,11 @@ class ComponentNode(Node):
 
     def _matched(self) -> bool:
         return all(
-            publisher.get_subscription_count() >= _subscribers(topic, self.peers) for topic, publisher in self.outputs
+            publisher.get_subscription_count() >= topics.subscribers_of(topic, self.peers)
+            for topic, publisher in self.outputs
         ) and all(
-            subscription.get_publisher_count() >= _publishers(topic, self.peers) for topic, subscription in self._inputs
+            subscription.get_publisher_count() >= topics.publishers_of(topic, self.peers)
+            for topic, subscription in self._inputs
         )
 
     # -- diagnostics -----------------------------------------------------------------------------------
@@ -301,7 +311,7 @@ class ComponentNode(Node):
         if self._clock_stands:
             return "use_sim_time is set, and /clock " + ("stands still" if self._clock_ns else "has not come yet")
         now_s = self.now_s()
-        for topic in self.needs:
+        for topic in (topics.own_topic(self.person, needed) for needed in self.needs):
             heard_s = self._heard_s.get(topic)
             silent_s = now_s - (self._begin_s if heard_s is None else heard_s)
             if silent_s > IDLE_S:
@@ -326,23 +336,13 @@ class ComponentNode(Node):
         message.status = [
             DiagnosticStatus(
                 level=level,
-                name=f"{self.get_namespace().strip('/')}/{self.component}",
+                name=f"{self.get_namespace().strip('/')}/{self.entry}",
                 message=text,
                 hardware_id=HARDWARE_ID,
                 values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
             )
         ]
         self._diagnostics.publish(message)
-
-
-def _publishers(topic: str, nodes: list[str]) -> int:
-    # Every node publishes diagnostics; the table omits them.
-    return len(nodes) if topic == "/diagnostics" else publishers_of(topic, nodes)
-
-
-def _subscribers(topic: str, nodes: list[str]) -> int:
-    # The bringup reads diagnostics too.
-    return subscribers_of(topic, nodes) + (topic == "/diagnostics" and bool(nodes))
 
 
 __all__ = ["ERROR", "HARDWARE_ID", "OK", "WARN", "ComponentNode", "Gaps", "MessageInfo"]

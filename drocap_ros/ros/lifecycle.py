@@ -55,7 +55,9 @@ class ManagedComponent(ComponentNode, LifecycleNodeMixin):
         self._refusal: Exception | None = None
         self._ended = False
         self._autostart: bool = self.declare_parameter("autostart", True).value
-        self._activates_itself = bool(self.declare_parameter("graph_running", False).value) or not self.peers
+        #: Whether the graph ran already, and this node in it.
+        self.restarted = bool(self.declare_parameter("graph_running", False).value)
+        self._activates_itself = self.restarted or not self.peers
         if self._is_source:
             self.create_timer(0.1, self._shut_down_when_ended)
         answer_impossible_transitions(self, partial(self.report, WARN))

@@ -18,6 +18,7 @@ from drocap_ros.config import section_types
 from drocap_ros.errors import ParameterError
 from drocap_ros.parameters import Parameters, Values
 from drocap_ros.ros.rclpy_internals import overridden_parameters
+from drocap_ros.ros.topics import section_of
 
 P = TypeVar("P", bound=Parameters)
 
@@ -50,7 +51,7 @@ def declare_parameters(node: Node, defaults: P) -> P:
 def parameter_help(component: str) -> str:
     """One line for each parameter of a component: name, default, unit, description."""
     lines = []
-    for spec in dataclasses.fields(section_types()[component]):
+    for spec in dataclasses.fields(section_types()[section_of(component)]):
         unit = f" {spec.metadata['unit']}" if spec.metadata.get("unit") else ""
         lines.append(f"  {spec.name} ({spec.default!r}{unit}): {spec.metadata['description']}")
     return "\n".join(lines)
@@ -101,7 +102,7 @@ class ParameterSurvey:
     def ask_new_nodes(self) -> None:
         """Ask the nodes that appeared since the last call; returns at once."""
         for name, near in self._beside.items():
-            if name not in self._asked:
+            if name in self._types and name not in self._asked:
                 self._asked.add(name)
                 self._take(name, {key: near.get_parameter(key).value for key in self._names(name)})
         for name, namespace in self._node.get_node_names_and_namespaces():

@@ -20,6 +20,7 @@ from drocap_ros.errors import InputError, NodeError
 from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.spin import node_main
+from drocap_ros.ros.topics import component_of, section_of
 
 #: TF has its usual place in this namespace only; another graph has its own, ``NAMESPACE/tf``, since the frames of two
 #: drones have the same names.
@@ -49,12 +50,13 @@ class LaunchContext:
     def __init__(self, names: list[str], namespace: str, domain_id: int, folder: Path) -> None:
         self.names = names
         self.folder = folder
-        self.ros_arguments = ["--ros-args", "-r", f"__ns:={namespace}", *remaps(namespace), "--disable-stdout-logs"]
+        self.ros_arguments = ["--ros-args", "-r", f"__ns:={namespace}", "--disable-stdout-logs"]
+        self.namespace = namespace
         self.environment = {**_LEAN, **os.environ, "ROS_DOMAIN_ID": str(domain_id)}
         # The server of this Python process serves all its graphs; it has no thread besides those of LTTng, which its
         # forks do not need.
         solvers = ["scipy.linalg.lapack", "scipy.ndimage"] if "bundle_adjuster" in names else []
-        _FORKSERVER.set_forkserver_preload([*(f"drocap_ros.nodes.{name}" for name in names), *solvers])
+        _FORKSERVER.set_forkserver_preload([*(f"drocap_ros.nodes.{component_of(name)[0]}" for name in names), *solvers])
         path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
         resource_tracker.ensure_running()  # which unblocks the signal
         with environment({**_LEAN, **os.environ, "PYTHONPATH": path}), _blocked(signal.SIGTERM):
@@ -63,7 +65,7 @@ class LaunchContext:
     def parameter_file(self, name: str, config: DrocapConfig, restarted: bool) -> Path:
         """Write a node's parameters."""
         path = self.folder / f"{name}.yaml"
-        section = config.to_parameter_file()[f"/**/{name}"]["ros__parameters"]
+        section = config.to_parameter_file()[f"/**/{section_of(name)}"]["ros__parameters"]
         values = {**section, "graph_nodes": ",".join(self.names), "graph_running": restarted}
         path.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}), encoding="utf-8")
         return path
@@ -75,7 +77,8 @@ class NodeProcess:
     def __init__(self, name: str, config: DrocapConfig, context: LaunchContext, restarted: bool = False) -> None:
         self.name = name
         self._log = context.folder / f"{name}.log"
-        arguments = [*context.ros_arguments, "--params-file", str(context.parameter_file(name, config, restarted))]
+        parameters = str(context.parameter_file(name, config, restarted))
+        arguments = [*context.ros_arguments, *remaps(name, context.namespace), "--params-file", parameters]
         variables = context.environment | fastdds.environment()
         # As a daemon it does not survive this process.
         self._process = _FORKSERVER.Process(
@@ -149,18 +152,20 @@ def _blocked(number: signal.Signals) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def remaps(namespace: str) -> list[str]:
-    """ROS arguments that keep one graph's TF from another's."""
-    return [] if namespace == DEFAULT_NAMESPACE else ["-r", f"/tf:={namespace.rstrip('/')}/tf"]
+def remaps(name: str, namespace: str = DEFAULT_NAMESPACE) -> list[str]:
+    """ROS arguments that give a node its name and keep one graph's TF from another's."""
+    tf = [] if namespace == DEFAULT_NAMESPACE else ["-r", f"/tf:={namespace.rstrip('/')}/tf"]
+    return ["-r", f"__node:={name}", *tf]
 
 
 def node_class(name: str) -> type[ComponentNode]:
     """Class of a node by its name; only its module is imported."""
-    module = importlib.import_module(f"drocap_ros.nodes.{name}")
+    component, _ = component_of(name)
+    module = importlib.import_module(f"drocap_ros.nodes.{component}")
     found: type[ComponentNode] = next(
         value
         for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, ComponentNode) and value.__dict__.get("component") == name
+        if isinstance(value, type) and issubclass(value, ComponentNode) and value.__dict__.get("component") == component
     )
     return found
 

@@ -1,4 +1,4 @@
-"""The subject by REP 155: ``/humans/bodies`` topics and TF frames.
+"""The subject, and whoever is followed beside it, by REP 155: ``/humans/bodies`` topics and TF frames.
 
 The messages are those of ``hri_msgs`` 2; ``make setup`` builds the four of them, a ROS installation has the package
 ``ros-DISTRO-hri-msgs``.  Without them only the frames are published.
@@ -105,16 +105,15 @@ def region(observation: PoseObservation, header: Header) -> Message:
 
 
 class HumanTopics:
-    """Publishers of the tracked body; destroyed when the track ends."""
+    """Publishers of the tracked bodies, by the topics of their keypoints; destroyed when the track ends."""
 
     def __init__(self, node: Node, frame_prefix: str = "") -> None:
         self._node, self._prefix = node, frame_prefix
         self._ids = node.create_publisher(hri.IdsList, f"{_BODIES}/tracked", _QOS)
-        self._now = ""
-        self._publishers: list[Publisher] = []
+        self._tracked: dict[str, tuple[str, Publisher, Publisher]] = {}
 
-    def publish(self, message: Pose2D) -> None:
-        """Publish the tracked body's identifier, box and keypoints.
+    def publish(self, topic: str, message: Pose2D) -> None:
+        """Publish a body's box and keypoints, and the identifiers of all.
 
         Raises
         ------
@@ -123,20 +122,19 @@ class HumanTopics:
         """
         observation = pose2d_from_ros(message)
         now = body_id(message.track_id, self._prefix) if observation.has_subject else ""
-        if now != self._now:
-            self._change(now)
-        self._ids.publish(hri.IdsList(header=message.header, ids=[now] if now else []))
+        before, *old = self._tracked.get(topic, ("",))
+        if now != before:
+            for publisher in old:
+                self._node.destroy_publisher(publisher)
+            self._tracked.pop(topic, None)
+            if now:
+                self._tracked[topic] = (
+                    now,
+                    self._node.create_publisher(hri.Skeleton2D, f"{_BODIES}/{now}/skeleton2d", _QOS),
+                    self._node.create_publisher(hri.NormalizedRegionOfInterest2D, f"{_BODIES}/{now}/roi", _QOS),
+                )
+        self._ids.publish(hri.IdsList(header=message.header, ids=[name for name, *_ in self._tracked.values()]))
         if now:
-            skeletons, regions = self._publishers
+            _, skeletons, regions = self._tracked[topic]
             skeletons.publish(skeleton2d(observation, message.header))
             regions.publish(region(observation, message.header))
-
-    def _change(self, now: str) -> None:
-        for publisher in self._publishers:
-            self._node.destroy_publisher(publisher)
-        self._now, self._publishers = now, []
-        if now:
-            self._publishers = [
-                self._node.create_publisher(hri.Skeleton2D, f"{_BODIES}/{now}/skeleton2d", _QOS),
-                self._node.create_publisher(hri.NormalizedRegionOfInterest2D, f"{_BODIES}/{now}/roi", _QOS),
-            ]

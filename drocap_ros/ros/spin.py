@@ -116,7 +116,8 @@ def node_main(node_class: type[ComponentNode]) -> int:
     _stop_on_signal(stop)
     try:
         # A restarted node keeps the usual priority until it is ready.
-        spin(node_class(), executor, stop, partial(lower_priority, NODES[node_class.component].niceness))
+        node = node_class()
+        spin(node, executor, stop, partial(lower_priority, NODES[node.entry].niceness))
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)
         return error.exit_status
