@@ -29,6 +29,7 @@ from drocap_ros.errors import NodeError
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.conditions import PICTURE_CODES, ConditionCode
 from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.mavlink.guardian import PACKETS, PERIOD_S
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.observation import PoseObservation
@@ -256,6 +257,14 @@ def _kill_bridge(flying: Scene) -> None:
     flying.listen(WATCH_S)
 
 
+def _kill_computer(flying: Scene) -> None:
+    """The guardian first: it would hold."""
+    for children in Path(f"/proc/{flying.bridge}/task").glob("*/children"):
+        for guardian in children.read_text().split():
+            os.kill(int(guardian), signal.SIGKILL)
+    _kill_bridge(flying)
+
+
 def _stop_bridge(flying: Scene) -> None:
     os.kill(flying.bridge, signal.SIGSTOP)
     flying.listen(3.0)
@@ -307,14 +316,17 @@ class Case(NamedTuple):
     quiet_s: float = float("inf")
 
 
+_HELD_S = PACKETS * PERIOD_S + 0.2  # for which a guardian sends, and a transmission
 _ANY: frozenset[State | ConditionCode] = frozenset()
+_BEFORE = frozenset({State.READY, State.IDLE})
 _STOOD = frozenset({ConditionCode.CONTROL_LOOP_STALLED, ConditionCode.PILOT_TOOK_OVER})
 _LOST = PICTURE_CODES | {ConditionCode.NO_SUBJECT}
 CASES = (
-    Case("bridge killed (SIGKILL)", _kill_bridge, LINK_S, True, _ANY, 0.2),
-    Case("bridge stopped for 3 s (SIGSTOP)", _stop_bridge, LINK_S, True, _STOOD),
+    Case("bridge killed (SIGKILL)", _kill_bridge, LINK_S, False, _ANY, _HELD_S),
+    Case("bridge and guardian killed (SIGKILL)", _kill_computer, LINK_S, True, _ANY, 0.2),
+    Case("bridge stopped for 3 s (SIGSTOP)", _stop_bridge, LINK_S, False, _STOOD),
     Case("bridge ended (SIGINT)", _end_bridge, LINK_S, False, _ANY),
-    Case("bridge killed and started again", _restart_bridge, LINK_S, True, frozenset({State.READY, State.IDLE}), 0.2),
+    Case("bridge killed and started again", _restart_bridge, LINK_S, False, _BEFORE, _HELD_S),
     Case("perception killed (SIGKILL)", _kill_perception, FRAME_S, False, _LOST),
     Case("perception stopped for 3 s (SIGSTOP)", _stop_perception, FRAME_S, False, _LOST),
     Case("camera sends nothing", _stop_camera, FRAME_S, False, _LOST),

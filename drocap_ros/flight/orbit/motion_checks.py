@@ -233,7 +233,7 @@ def outdated_condition(seen: Observed, oldest_s: float) -> Condition:
         if pictures.silent_s > late_s or math.isinf(pictures.silent_s):
             return condition(_C.PICTURES_LOST, age_s=age_s, silent_s=pictures.silent_s)
         return condition(_C.PICTURES_LATE, age_s=age_s, late_s=late_s)
-    if seen.vehicle.age_s > pictures.age_s:
+    if -_FUTURE_S < pictures.age_s < seen.vehicle.age_s:
         return condition(_C.ATTITUDE_OUTDATED, age_s=seen.vehicle.age_s)
     if pictures.frozen:
         return condition(_C.PICTURES_FROZEN, age_s=age_s)

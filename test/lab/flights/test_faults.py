@@ -9,6 +9,7 @@ from lab.flights.fault_table import FAULTS
 SUBSET = {
     ("perception stops", "ardupilot"),
     ("image frozen, stamps continue", "px4"),
+    ("stamps 5 s in the future", "ardupilot"),
     ("process killed (SIGKILL)", "px4"),
     ("process restarts after 1 s", "ardupilot"),
     ("computer dies", "px4"),
