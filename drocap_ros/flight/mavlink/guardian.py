@@ -50,9 +50,9 @@ class Guardian:
         self.ended = False  # the bridge's process
 
     @property
-    def done(self) -> bool:
-        """Whether the bridge has ended, and nothing is left to be sent."""
-        return self.ended and not self._packets
+    def armed(self) -> bool:
+        """Whether there is anything to be sent."""
+        return bool(self._packets)
 
     def take(self, now_s: float, packets: Sequence[bytes]) -> None:
         """Take what the bridge hands over; nothing: it commands nothing."""
@@ -146,10 +146,10 @@ class _Port:
 def main(channel: socket.socket, limit_s: float) -> None:
     """Take what the bridge hands over, until its process ends; then hold, where it has commanded motion."""
     guardian, port = Guardian(limit_s), _Port()
-    while not guardian.done:
+    while guardian.armed or not guardian.ended:
         if guardian.ended:
             time.sleep(_CHECK_S)
-        elif select.select([channel], [], [], _CHECK_S)[0]:
+        elif select.select([channel], [], [], _CHECK_S if guardian.armed else None)[0]:
             data, descriptors, *_ = socket.recv_fds(channel, _LONGEST_ORDER, 1)
             guardian.ended = not data
             if data:
