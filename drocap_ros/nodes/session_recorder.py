@@ -79,7 +79,7 @@ class SessionRecorderNode(ManagedComponent):
 
     def acquire(self) -> None:
         """Open a session; a second one of this node takes the next free name."""
-        folder = Path(self.config.session_dir or dated_name(self.get_clock().now().nanoseconds))
+        folder = Path(self.config.session_dir or dated_name(self.now_ns(), self.get_namespace()))
         if self.config.if_taken == "next" or self._sessions:
             folder = _free_name(folder)
         writer = SessionWriter(folder, self.config, session_provenance(self.get_namespace()))

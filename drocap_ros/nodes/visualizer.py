@@ -20,7 +20,7 @@ from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import MAP, pose3d_from_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
-from drocap_ros.ros.rep155 import AVAILABLE, MISSING, HumanTopics, human_transforms
+from drocap_ros.ros.rep155 import AVAILABLE, MISSING, HumanTopics, human_transforms, prefix_of
 from drocap_ros.ros.topics import PLACES, TFMessage
 from drocap_ros.view.visualizer_config import RateLimit, VisualizerConfig
 
@@ -51,7 +51,9 @@ class VisualizerNode(ComponentNode):
         self._path_ns = -(10**18)
         #: Last pose in ``map`` by the prefix of the person's topics.
         self._placed_ns = defaultdict[str, int](lambda: -(10**18))
-        self._humans = HumanTopics(self, self.config.frame_prefix) if self.config.human_topics and AVAILABLE else None
+        # REP 155's topics have no namespace.
+        self._prefix = prefix_of(self.get_namespace(), self.config.frame_prefix)
+        self._humans = HumanTopics(self, self._prefix) if self.config.human_topics and AVAILABLE else None
         if self.config.human_topics and not AVAILABLE:
             self.get_logger().warning(MISSING)
         self.input("pose2d", self._on_pose2d)
@@ -91,9 +93,8 @@ class VisualizerNode(ComponentNode):
         here = placed or (not latest and abs(stamp_ns - self._placed_ns[person]) > _PLACED_NS)
         if self._tf is None or not here:
             return
-        prefix = self.config.frame_prefix
-        human = human_transforms(message, prefix) if self.config.human_topics else []
-        if transforms := body_transforms(message, prefix) + human:
+        human = human_transforms(message, self._prefix) if self.config.human_topics else []
+        if transforms := body_transforms(message, self.config.frame_prefix) + human:
             self._tf.publish(TFMessage(transforms=transforms))
 
     def _on_latest(self, message: Pose3D) -> None:

@@ -65,7 +65,7 @@ class Companions:
         self._boxes: deque[list[np.ndarray]] = deque([[], []], maxlen=2)
 
     def process(self, image: np.ndarray, subject: PoseObservation) -> dict[int, PoseObservation]:
-        """Who is in each place in the next image; a place whose person it does not show has no keypoints.
+        """Who is in each place in the next image; a person whom it does not show has a box and no keypoints.
 
         Parameters
         ----------
@@ -111,9 +111,14 @@ class Companions:
         self._numbers = {one: self._numbers[one] for one in self._numbers if one in others or one in bodies.gone}
 
     def _shown(self, one: Body | None, subject: PoseObservation) -> PoseObservation:
-        if one is None or one.seen is None or not one.shown(subject.stamp_ns):
+        if one is None or one.seen is None:
             return PoseObservation(subject.stamp_ns, 0, subject.image_size)
-        return replace(one.seen, track_id=self._numbers[one])
+        seen = replace(one.seen, stamp_ns=subject.stamp_ns, track_id=self._numbers[one])
+        if one.shown(subject.stamp_ns):
+            return seen
+        blank = {name: np.full_like(getattr(seen, name), np.nan) for name in ("keypoints", "covariance")}
+        box, confidence = one.track.box.astype(np.float32), np.zeros_like(seen.confidence)
+        return replace(seen, roi=box, detection_score=0.0, confidence=confidence, space=None, **blank)
 
     def close(self) -> None:
         """End the threads."""

@@ -42,10 +42,11 @@ def model_hashes(folder: str | Path) -> str:
     return json.dumps({path.name: sha256_of(path) for path in Path(folder).glob("*.onnx")}, sort_keys=True)
 
 
-def dated_name(now_ns: int) -> str:
-    """Name of a new session, from the clock: ``session_20260131T235959Z``."""
+def dated_name(now_ns: int, namespace: str) -> str:
+    """Name of a new session, from the clock: ``session_20260131T235959Z``, in another namespace than ours with that."""
     moment = datetime.fromtimestamp(now_ns * 1e-9, tz=timezone.utc)
-    return f"session_{moment:%Y%m%dT%H%M%SZ}"
+    drone = namespace.strip("/").replace("/", "_")
+    return f"session_{moment:%Y%m%dT%H%M%SZ}" + (f"_{drone}" if drone not in ("", "drocap") else "")
 
 
 def _versions() -> dict[str, str]:

@@ -11,7 +11,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 
 from drocap_ros.geometry.alignment import torso_frame
 from drocap_ros.geometry.rotations import quaternion_from_matrix
@@ -19,6 +19,7 @@ from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.recording.session import Message
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, transform_to_ros
+from drocap_ros.ros.topics import KEPT_QOS
 from drocap_ros.skeleton import joint_set
 
 try:
@@ -28,7 +29,7 @@ except ImportError:  # optional: see above
 
 AVAILABLE = hri is not None
 MISSING = "hri_msgs is missing: only the frames of REP 155; install ros-$ROS_DISTRO-hri-msgs, or run `make setup`"
-_BODIES = "/humans/bodies"
+_BODIES, _PERSONS = "/humans/bodies", "/humans/persons"
 _QOS = QoSProfile(depth=10)
 
 _PARTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -43,9 +44,20 @@ _CODES = {
 }
 
 
+def prefix_of(namespace: str, frame_prefix: str) -> str:
+    """Prefix of the bodies of a graph: the given one, else the namespace, where it is not the usual one."""
+    return frame_prefix or ("" if namespace == "/drocap" else namespace.strip("/"))
+
+
 def body_id(track_id: int, frame_prefix: str = "") -> str:
     """Identifier of a track; the prefix distinguishes the bodies of two drones.  No name in ROS begins with a digit."""
     return "_".join([*filter(None, frame_prefix.split("/")), f"b{track_id}"])
+
+
+def person_id(body: str) -> str:
+    """Identifier of the person whose body it is: tracks are one person's, whose number is used for nobody else."""
+    before, _, number = body.rpartition("b")
+    return f"{before}p{number}"
 
 
 def human_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformStamped]:
@@ -110,7 +122,8 @@ class HumanTopics:
     def __init__(self, node: Node, frame_prefix: str = "") -> None:
         self._node, self._prefix = node, frame_prefix
         self._ids = node.create_publisher(hri.IdsList, f"{_BODIES}/tracked", _QOS)
-        self._tracked: dict[str, tuple[str, Publisher, Publisher]] = {}
+        self._persons = node.create_publisher(hri.IdsList, f"{_PERSONS}/tracked", _QOS)
+        self._tracked: dict[str, tuple[str, Publisher, Publisher, Publisher]] = {}
 
     def publish(self, topic: str, message: Pose2D) -> None:
         """Publish a body's box and keypoints, and the identifiers of all.
@@ -132,9 +145,13 @@ class HumanTopics:
                     now,
                     self._node.create_publisher(hri.Skeleton2D, f"{_BODIES}/{now}/skeleton2d", _QOS),
                     self._node.create_publisher(hri.NormalizedRegionOfInterest2D, f"{_BODIES}/{now}/roi", _QOS),
+                    self._node.create_publisher(String, f"{_PERSONS}/{person_id(now)}/body_id", KEPT_QOS),
                 )
-        self._ids.publish(hri.IdsList(header=message.header, ids=[name for name, *_ in self._tracked.values()]))
+                self._tracked[topic][-1].publish(String(data=now))
+        ids = [name for name, *_ in self._tracked.values()]
+        self._ids.publish(hri.IdsList(header=message.header, ids=ids))
+        self._persons.publish(hri.IdsList(header=message.header, ids=[person_id(name) for name in ids]))
         if now:
-            _, skeletons, regions = self._tracked[topic]
+            _, skeletons, regions, _ = self._tracked[topic]
             skeletons.publish(skeleton2d(observation, message.header))
             regions.publish(region(observation, message.header))

@@ -23,7 +23,10 @@ class VisualizerConfig(Parameters):
     )
     path_points: int = param(600, "points kept of the camera's path", minimum=2, maximum=100_000)
     path_period_s: float = param(0.2, "time between two points of the path", unit="s", minimum=0.01, maximum=60)
-    frame_prefix: str = param("", "prefix of the body's TF frames, e.g. drone2/ with two drones")
+    frame_prefix: str = param(
+        "",
+        "prefix of the body's TF frames, e.g. drone_2/ with two drones; for REP 155 empty = the namespace",
+    )
     human_topics: bool = param(False, "publish the subject by REP 155: /humans/bodies topics, frames body_<id>")
 
 

@@ -104,7 +104,10 @@ def test_who_leaves_frees_the_place_and_a_number_is_never_given_twice(three: Sho
     first = followed(whole[:15] + without[15:], companions)
     assert {o.track_id for o in first[14].values()} == {1, 1001, 1002}
     place = next(n for n, o in first[14].items() if o.track_id == 1001)
-    assert not any(places[place].has_subject for places in first[16:])
+    assert np.isnan(keypoints(first[16:], 1001)).all()
+    hidden_s = (first[15][place].stamp_ns - first[14][place].stamp_ns) * 1e-9
+    assert all(places[place].has_subject for places in first[15 : 15 + round(1.9 / hidden_s)])
+    assert not any(places[place].has_subject for places in first[15 + round(2.2 / hidden_s) :])
     assert companions.followed == [1002]
     second = followed(whole, companions)
     again = {o.track_id for places in second for n, o in places.items() if n > 1} - {0}

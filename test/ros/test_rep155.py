@@ -10,7 +10,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 from visualization_msgs.msg import MarkerArray
 
 from drocap_ros.bringup import free_domain
@@ -21,7 +21,7 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.ros import rep155
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key
-from drocap_ros.ros.topics import RESULT_QOS, TFMessage
+from drocap_ros.ros.topics import KEPT_QOS, RESULT_QOS, TFMessage
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.view.visualizer_config import VisualizerConfig
@@ -108,14 +108,15 @@ def test_keypoints_are_relative_to_the_image_and_none_lies_outside(capture):
 
 
 @contextlib.contextmanager
-def graph(**parameters):
+def graph(namespace="/drocap", **parameters):
     """The visualizer, a node beside it, and a function that serves both until a condition holds."""
     with free_domain() as domain_id:
         context = Context()
         rclpy.init(args=[], context=context, domain_id=domain_id)
         executor = SingleThreadedExecutor(context=context)
-        node = visualizer.VisualizerNode(VisualizerConfig(**parameters), context=context, use_global_arguments=False)
-        other = Node("other", context=context, namespace="/drocap", use_global_arguments=False)
+        place = {"context": context, "namespace": namespace, "use_global_arguments": False}
+        node = visualizer.VisualizerNode(VisualizerConfig(**parameters), **place)
+        other = Node("other", **place)
         for each in (node, other):
             executor.add_node(each)
 
@@ -134,10 +135,13 @@ def graph(**parameters):
             context.try_shutdown()
 
 
-@pytest.mark.parametrize(("prefix", "name"), [("", "b7"), ("drone2/", "drone2_b7")])
-def test_tracked_body_is_published_while_it_is_tracked(capture, prefix, name):
+@pytest.mark.parametrize(
+    ("prefix", "namespace", "name"),
+    [("", "/drocap", "b7"), ("drone2/", "/drocap", "drone2_b7"), ("", "/drone_1", "drone_1_b7")],
+)
+def test_tracked_body_is_published_while_it_is_tracked(capture, prefix, namespace, name):
     points = np.tile([320.0, 120.0], (15, 1))
-    with graph(human_topics=True, frame_prefix=prefix) as (node, other, until):
+    with graph(namespace, human_topics=True, frame_prefix=prefix) as (node, other, until):
         ids, skeletons, boxes, frames = [], [], [], []
         qos = QoSProfile(depth=10)
         other.create_subscription(hri.IdsList, "/humans/bodies/tracked", lambda m: ids.append(list(m.ids)), qos)
@@ -169,6 +173,27 @@ def test_tracked_body_is_published_while_it_is_tracked(capture, prefix, name):
         keypoints.publish(pose2d_to_ros(observation(points, track_id=0), "camera_optical"))
         until(lambda: ids[-1] == [])
         until(lambda: not node.get_publishers_info_by_topic(f"/humans/bodies/{name}/skeleton2d"))
+
+
+def test_each_of_several_persons_has_topics_of_its_own_until_it_leaves():
+    points = np.tile([320.0, 120.0], (15, 1))
+    with graph(human_topics=True) as (node, other, until):
+        bodies, persons, owners = [], [], []
+        other.create_subscription(hri.IdsList, "/humans/bodies/tracked", lambda m: bodies.append(list(m.ids)), 10)
+        other.create_subscription(hri.IdsList, "/humans/persons/tracked", lambda m: persons.append(list(m.ids)), 10)
+        other.create_subscription(String, "/humans/persons/p1001/body_id", lambda m: owners.append(m.data), KEPT_QOS)
+        topics = ("pose2d", "person_2/pose2d", "person_3/pose2d")
+        publishers = [other.create_publisher(Pose2D, topic, RESULT_QOS) for topic in topics]
+        until(lambda: all(p.get_subscription_count() for p in publishers))
+        until(lambda: all(node.count_subscribers(f"/humans/{of}/tracked") for of in ("bodies", "persons")))
+        for publisher, number in zip(publishers, (7, 1001, 1002), strict=True):
+            publisher.publish(pose2d_to_ros(observation(points, track_id=number), "camera_optical"))
+        until(lambda: bodies and set(bodies[-1]) == {"b7", "b1001", "b1002"})
+        until(lambda: persons and set(persons[-1]) == {"p7", "p1001", "p1002"})
+        until(lambda: owners == ["b1001"])
+        publishers[1].publish(pose2d_to_ros(observation(points, track_id=0), "camera_optical"))
+        until(lambda: set(bodies[-1]) == {"b7", "b1002"} and set(persons[-1]) == {"p7", "p1002"})
+        until(lambda: not node.get_publishers_info_by_topic("/humans/bodies/b1001/roi"))
 
 
 def test_without_hri_msgs_the_frames_remain_and_the_status_names_the_reason(capture, monkeypatch):

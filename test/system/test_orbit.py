@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo
 
-from drocap_ros.bringup import bringup
+from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.conditions import ConditionCode
@@ -80,10 +80,11 @@ class Drone:
 
 
 @contextlib.contextmanager
-def flying(**values):
+def flying(namespace="/drocap", domain_id=None, **values):
     port = free_udp_port()
     config = DrocapConfig().replace("mavlink_bridge", url=f"udpin:127.0.0.1:{port}", **values)
-    with bringup(config, ["mavlink_bridge"]) as graph, Drone(graph, port) as drone:
+    place = {"namespace": namespace, "domain_id": domain_id}
+    with bringup(config, ["mavlink_bridge"], **place) as graph, Drone(graph, port) as drone:
         got = []
         graph.node.create_subscription(OrbitStatus, "orbit/status", got.append, TOPICS["orbit/status"].qos)
         yield graph, drone, got
@@ -94,7 +95,8 @@ def operator(graph, *words):
 
     It runs in a process of its own: a second ROS context in this one would delay the drone's thread for a second.
     """
-    command = [sys.executable, "-m", "drocap_ros.cli", "orbit", *words, "--domain-id", str(graph.domain_id)]
+    place = ["--domain-id", str(graph.domain_id), "--namespace", graph.namespace]
+    command = [sys.executable, "-m", "drocap_ros.cli", "orbit", *words, *place]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen([*command, "--timeout", "20"], env=env, stdout=subprocess.PIPE, text=True) as process:
         graph.wait_until(lambda: process.poll() is not None, 60, f"an answer to {words}")
@@ -167,6 +169,42 @@ def test_a_second_bridge_ends_the_orbit_of_the_first_and_flies_none():
             graph.wait_until(lambda: SECOND_BRIDGE in {m.condition for m in got}, 10, "the second bridge to be seen")
             assert time.monotonic() - begin - ready_s < 2.0
             graph.wait_until(lambda: drone.copter.mode == "BRAKE", 15, "the hold mode")
+
+
+def test_a_command_to_one_of_two_drones_in_one_graph_does_not_move_the_other(monkeypatch):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    limits = {"commands_enabled": True, "max_state_age_s": 0.5, "watchdog_s": 0.5}
+    with (
+        free_domain() as domain,
+        flying("/drone_1", domain, **limits) as (graph, drone, got),
+        flying("/drone_2", domain, **limits) as (graph_2, other, got_2),
+    ):
+
+        def both(condition, timeout_s, what):
+            graph.wait_until(lambda: graph_2.wait(condition, 0.0) and condition(), timeout_s, what)
+
+        both(lambda: {m[-1].state for m in (got, got_2) if m} == {OrbitStatus.READY}, 60, "two ready drones")
+        assert operator(graph, "start", "--speed", "15") == (0, "orbiting the subject")
+        place = other.copter.body.position.copy()
+        begin = time.monotonic()
+        both(lambda: time.monotonic() - begin > 4.0, 30, "four seconds")
+        # A busy machine may hold it soon.
+        assert OrbitStatus.ORBITING in {m.state for m in got}
+        assert drone.copter.accepted_setpoints > 0
+        assert other.copter.accepted_setpoints == 0
+        assert {m.state for m in got_2} <= {OrbitStatus.IDLE, OrbitStatus.READY}
+        assert "SET_POSITION_TARGET_LOCAL_NED" not in other.copter.received
+        # Wind and the autopilot's own errors.
+        assert np.linalg.norm(other.copter.body.position - place) < 1.0
+        assert operator(graph, "stop")[0] == 0
+        topics = {name for name, _ in graph.node.get_topic_names_and_types()}
+        of_all = {"/diagnostics", "/parameter_events", "/rosout"}
+        assert {name.split("/")[1] for name in topics - of_all} == {"drone_1", "drone_2"}
+        assert {"/drone_1/tf", "/drone_2/tf", "/drone_1/vehicle/state", "/drone_2/vehicle/state"} <= topics
+        services = {name.split("/")[1] for name, _ in graph.node.get_service_names_and_types()}
+        assert services == {"drone_1", "drone_2"}
+        nodes = dict(graph.node.get_node_names_and_namespaces())
+        assert set(nodes.values()) <= {"/drone_1", "/drone_2"}
 
 
 def relabelled(message):

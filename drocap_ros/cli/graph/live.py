@@ -76,7 +76,7 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
     domain_id = chosen_domain(args)
     bringup = import_bringup().bringup
     if "session_recorder" in nodes and not config.session_recorder.session_dir:
-        name = dated_name(time.time_ns())
+        name = dated_name(time.time_ns(), args.namespace)
         config = config.replace("session_recorder", session_dir=str(Path(name).absolute()))
     recorded = Path(config.session_recorder.session_dir)
     before = _session_folders(recorded)
