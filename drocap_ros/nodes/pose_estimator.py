@@ -47,6 +47,7 @@ class PoseEstimatorNode(ManagedComponent):
     def acquire(self) -> None:
         """Load the networks."""
         self._estimator = PoseEstimator(models_folder(self.config.models_dir), self.config)
+        self._estimator.detector.accepts_other_sizes()  # which takes time, under load most of all
         if self._estimator.limited_use:
             self.details[Key.NETWORKS] = self._estimator.limited_use
 

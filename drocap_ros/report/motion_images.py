@@ -27,6 +27,8 @@ MAX_BYTES = 8_000_000  # bytes; mail often ends at 10 MB
 _LONG_SIDE = 640
 #: How an image is compressed, the best first: at a share of that size and a quality.
 _STEPS = tuple((share, quality) for share in (1, 2, 4) for quality in (75, 60, 45, 30))
+#: Growth of the bytes by a step up, of three videos at least 1.13: a step that cannot fit is not tried.
+_GROWTH = 1.12
 #: Margin of the crop, as a share of its size.
 _MARGIN = 0.12
 #: Tolerances of the checks whether images belong to a motion: their number (re-encoding loses a few), their rate, and
@@ -243,7 +245,7 @@ class _Encoder:
         x0, y0, x1, y1 = self.box
         small = shrink(image[y0:y1, x0:x1], self._size)
         data = self._compressed(small, self._step)
-        while len(data) <= self._most and self._step:
+        while len(data) * _GROWTH <= self._most and self._step:
             if len(better := self._compressed(small, self._step - 1)) > self._most:
                 break
             data, self._step = better, self._step - 1

@@ -41,7 +41,7 @@ class Detector:
         self.spec = spec
         self._normalize = Normalizer(spec)
         self._decode = DECODERS[spec.layout]
-        self._dynamic = spec.layout == "rtmdet-maps" and self._accepts_other_sizes()
+        self._dynamic: bool | None = None  # not asked yet
 
     def detect(
         self,
@@ -63,7 +63,7 @@ class Detector:
         height, width = image.shape[:2]
         window = window or (0, 0, width, height)
         spec = self.spec
-        if reduced is not None and self._dynamic:
+        if reduced is not None and self.accepts_other_sizes():
             spec = dataclasses.replace(spec, input_size=_reduced_size(window, reduced * min(spec.input_size)))
         canvas, place = letterbox(image, window, spec.input_size, spec.letterbox == "centre")
         raw = self._decode(self.model(self._normalize(canvas)), spec, threshold)
@@ -74,8 +74,16 @@ class Detector:
         kept = kept[suppress(boxes[kept], raw.scores[kept])]
         return Detections(boxes[kept], raw.scores[kept].astype(np.float32))
 
-    def _accepts_other_sizes(self) -> bool:
-        """Whether the network accepts inputs of other sizes, with outputs to match."""
+    def accepts_other_sizes(self) -> bool:
+        """Whether the network accepts inputs of other sizes, with outputs to match.
+
+        The first answer takes a second session, which load shedding alone needs: live nodes ask before their images.
+        """
+        if self._dynamic is None:
+            self._dynamic = self.spec.layout == "rtmdet-maps" and self._made_dynamic()
+        return self._dynamic
+
+    def _made_dynamic(self) -> bool:
         width, height = 6 * _STRIDE, 4 * _STRIDE
         if self.spec.channels_last or not self.model.make_dynamic():
             return False

@@ -37,6 +37,7 @@ def sizes_seen(monkeypatch, detector):
 def test_reduced_input_shows_the_same_person(shared, walk, monkeypatch, window, reduced, size):
     detector = load_detector(shared / "models", CONFIG)
     whole = detector.detect(walk, window)
+    assert detector.accepts_other_sizes()
     seen = sizes_seen(monkeypatch, detector)
     found = detector.detect(walk, window, reduced=reduced)
     assert seen == [size]
@@ -47,7 +48,7 @@ def test_reduced_input_shows_the_same_person(shared, walk, monkeypatch, window, 
 
 def test_full_input_equals_the_fixed_export(shared, walk, monkeypatch):
     free, fixed = load_detector(shared / "models", CONFIG), load_detector(shared / "models", CONFIG)
-    fixed.model.make_fixed()
+    assert free.accepts_other_sizes()
     seen = sizes_seen(monkeypatch, free)
     a, b = free.detect(walk), fixed.detect(walk)
     assert seen == [(320, 320)] * 2
@@ -62,6 +63,7 @@ def tiny_maps():
 def test_network_with_fixed_outputs_keeps_its_size(tmp_path, monkeypatch):
     write_model(tmp_path / "rtmdet-tiny.onnx", (1, 3, 96, 128), tiny_maps())
     detector = load_detector(tmp_path, PoseEstimatorConfig())
+    assert not detector.accepts_other_sizes()
     seen = sizes_seen(monkeypatch, detector)
     assert len(detector.detect(np.zeros((200, 300, 3), np.uint8), reduced=0.5)) == 0
     assert seen == [(128, 96)]
