@@ -92,11 +92,14 @@ class Kill(NamedTuple):
 
 
 def killed(world: World, loop: OrbitLoop, dies: str = "computer") -> Kill:
-    """The bridge sends nothing from now on; where the computer dies, the guardian does not either."""
+    """The bridge commands nothing from now on; where the computer dies, its guardian does not either."""
     first, place = len(loop.rows), loop.copter.body.position.copy()
     at_s, speed = loop.t, float(np.linalg.norm(loop.copter.body.velocity))
     distance = float(np.hypot(*(loop.pelvis()[:2] - place[:2])))
-    loop.stopped, loop.dead = True, dies == "computer"
+    if dies == "computer":
+        loop.stopped = loop.dead = True
+    else:  # the new process commands nothing
+        loop.restart()
     loop.run(loop.t + TAIL_S)
     rows = loop.rows[first:]
     stood = [float(np.hypot(*(loop.pelvis(row.t_s)[:2] - place[:2]))) for row in rows]
