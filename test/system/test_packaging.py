@@ -83,17 +83,18 @@ def assert_colcon_installs(workspace, *option):
     build = ["colcon", "build", *option, "--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
     run(*build, "-DBUILD_TESTING=OFF", "-GNinja", cwd=workspace, env=ros)
     imports = "; ".join(f"import drocap_ros.nodes.{name}" for name in NODES)
-    check = f"import drocap_ros.msg as m; m.Pose2D(); print(m.__file__); {imports}; print(drocap_ros.nodes.__file__)"
+    ask = "from drocap_ros.revision import git_revision as r; print(r())"
+    check = (
+        f"import drocap_ros.msg as m; m.Pose2D(); print(m.__file__); {imports}; print(drocap_ros.nodes.__file__); {ask}"
+    )
     shell = f". install/setup.sh && python3 -c '{check}' && ls install/drocap_ros/lib/drocap_ros"
     lines = run("bash", "-c", shell, cwd=workspace, env=ros).split()
     # The workspace's own copy, not the one of the environment.
     install = str(workspace / "install")
     assert lines[0].startswith(install)
     assert lines[1].startswith(install)
-    assert set(lines[2:]) == {"drocap", *NODES}
-    ask = ". install/setup.sh && python3 -c 'from drocap_ros.revision import git_revision as r; print(r())'"
-    revision = git(workspace / "src" / "drocap_ros", "rev-parse", "HEAD")
-    assert run("bash", "-c", ask, cwd=workspace, env=ros).strip() == revision
+    assert lines[2] == git(workspace / "src" / "drocap_ros", "rev-parse", "HEAD")
+    assert set(lines[3:]) == {"drocap", *NODES}
     assert (workspace / "install" / "drocap_ros" / "share" / "drocap_ros" / "launch" / "drocap.launch.py").exists()
     run(
         "bash", "-c", ". install/setup.sh && install/drocap_ros/lib/drocap_ros/drocap --version", cwd=workspace, env=ros
