@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.contacts import FEET, HEIGHT_STD_M
+from drocap_ros.contacts import FEET
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.world_equations import WIDTH, normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
@@ -25,7 +25,7 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldState,
 )
 from drocap_ros.reconstruction.world.world_residuals import (
-    OUTLIER_SQUARE,
+    Contacts,
     WorldResiduals,
     WorldWeights,
     gradient,
@@ -91,22 +91,12 @@ class JoinedViews:
     """Residuals of all views at one point; parameters and members are those of :class:`WorldResiduals`."""
 
     def __init__(
-        self,
-        data: WorldInput,
-        weights: tuple[WorldWeights, ...],
-        state: WorldState,
-        contact: np.ndarray,
-        contact_weight: float,
-        outlier: float = OUTLIER_SQUARE,
-        floor_std: float = HEIGHT_STD_M,
+        self, data: WorldInput, weights: tuple[WorldWeights, ...], state: WorldState, contacts: Contacts
     ) -> None:
-        self.data, self.weights, self.state = data, weights, state
-        self.contact, self.contact_weight, self.outlier, self.floor_std = contact, contact_weight, outlier, floor_std
-        nowhere: np.ndarray = np.zeros((len(state.joints) - 1, len(FEET)))
+        self.data, self.weights, self.state, self.contacts = data, weights, state, contacts
+        nowhere = contacts._replace(probability=np.zeros((len(state.joints) - 1, len(FEET))))
         self.views = [
-            WorldResiduals(
-                view, weights[v], view_state(state, v), nowhere if v else contact, contact_weight, outlier, floor_std
-            )
+            WorldResiduals(view, weights[v], view_state(state, v), nowhere if v else contacts)
             for v, view in enumerate((data, *data.further))
         ]
         self.terms = {name: sum(view.terms[name] for view in self.views) for name in self.views[0].terms}
@@ -114,10 +104,7 @@ class JoinedViews:
 
     def moved(self, frames: np.ndarray, shared: np.ndarray) -> JoinedViews:
         """Residuals of the same cost after a step."""
-        state = self.state.moved(frames, shared)
-        return JoinedViews(
-            self.data, self.weights, state, self.contact, self.contact_weight, self.outlier, self.floor_std
-        )
+        return JoinedViews(self.data, self.weights, self.state.moved(frames, shared), self.contacts)
 
     def usual_outlier(self) -> float:
         """The largest of the views'."""

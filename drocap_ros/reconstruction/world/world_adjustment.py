@@ -32,7 +32,7 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldInput,
     WorldState,
 )
-from drocap_ros.reconstruction.world.world_residuals import OUTLIER_SQUARE, WorldResiduals, WorldWeights, gradient
+from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, WorldWeights, gradient
 
 #: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 1e-4
@@ -94,17 +94,11 @@ _Residuals: TypeAlias = WorldResiduals | JoinedViews
 
 
 def _residuals(
-    data: WorldInput,
-    weights: tuple[WorldWeights, ...],
-    state: WorldState,
-    contact: np.ndarray,
-    contact_weight: float,
-    outlier: float = OUTLIER_SQUARE,
-    floor_std: float = HEIGHT_STD_M,
+    data: WorldInput, weights: tuple[WorldWeights, ...], state: WorldState, contacts: Contacts
 ) -> _Residuals:
     if data.further:
-        return JoinedViews(data, weights, state, contact, contact_weight, outlier, floor_std)
-    return WorldResiduals(data, weights[0], state, contact, contact_weight, outlier, floor_std)
+        return JoinedViews(data, weights, state, contacts)
+    return WorldResiduals(data, weights[0], state, contacts)
 
 
 class _Stage(NamedTuple):
@@ -151,7 +145,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
     state = initial_state(data, start)
     stop, done, ground, floor_std = ITERATIONS, 0, float("nan"), HEIGHT_STD_M
     contact: np.ndarray = np.zeros((len(start.joints) - 1, len(FEET)))
-    outlier = _residuals(data, weights, state, contact, 0.0).usual_outlier()
+    outlier = _residuals(data, weights, state, Contacts(contact, 0.0)).usual_outlier()
     seen = np.any([view.weight > 0 if view.seen is None else view.seen for view in (data, *data.further)], axis=0)
     feet = RestingFeet(seen, data.fps, _still(data), start.joints)
     for stage in _stages(config, held):
@@ -161,7 +155,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         if stage.finds_floor:
             ground = _ground_spread(state, contact)
             floor_std = _floor_std(ground)
-        here = _residuals(data, weights, state, contact, stage.weight, outlier, floor_std)
+        here = _residuals(data, weights, state, Contacts(contact, stage.weight, outlier, floor_std))
         there = _improved(here, held, stage.locking)
         if there is None:
             stop = NO_DESCENT
@@ -170,7 +164,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         if stage.locking and here.cost - there.cost <= _CONVERGED * here.cost:
             stop = CONVERGED
             break
-    final = _residuals(data, weights, state, contact, config.contact_weight, floor_std=floor_std)
+    final = _residuals(data, weights, state, Contacts(contact, config.contact_weight, floor_std=floor_std))
     return _solution(final, ground, done, stop)
 
 
@@ -227,7 +221,7 @@ def _solution(final: _Residuals, ground: float, iterations: int, stop_reason: st
     return WorldSolution(
         joints=state.joints / state.globals[SCALE],
         state=state,
-        contact=final.contact,
+        contact=final.contacts.probability,
         std=std,
         turned=axes @ state.globals[MISALIGNMENT],
         turned_std=turned_std,
@@ -253,8 +247,9 @@ def _with_terms_that_last(final: WorldResiduals) -> WorldResiduals:
         camera_acceleration=fact * weights.camera_acceleration,
         depth=fact * weights.depth,
     )
-    weight, floor_std = fact * final.contact_weight, final.floor_std / float(np.sqrt(fact))
-    return WorldResiduals(final.data, weights, final.state, final.contact, weight, floor_std=floor_std)
+    contact, weight, _, floor_std = final.contacts
+    wide = Contacts(contact, fact * weight, floor_std=floor_std / float(np.sqrt(fact)))
+    return WorldResiduals(final.data, weights, final.state, wide)
 
 
 def _ground_spread(state: WorldState, contact: np.ndarray) -> float:

@@ -113,27 +113,26 @@ def weights_of(data: WorldInput) -> WorldWeights:
     )
 
 
-class WorldResiduals:
-    """Residuals at one point.
+class Contacts(NamedTuple):
+    """What is judged anew before every step of an adjustment: feet in contact, and outliers in the image.
 
-    contact : (F - 1, 4) probability that a point of ``FEET`` keeps its place between two frames
-    contact_weight : of that step, 1 = its standard deviation as configured
+    probability : (F - 1, 4) that a point of ``FEET`` keeps its place between two frames
+    weight : of that step, 1 = its standard deviation as configured
     outlier : squared image residual, in standard deviations, at which a joint has half its weight
     floor_std : m, spread of the heights of feet in contact
     """
 
-    def __init__(
-        self,
-        data: WorldInput,
-        weights: WorldWeights,
-        state: WorldState,
-        contact: np.ndarray,
-        contact_weight: float,
-        outlier: float = OUTLIER_SQUARE,
-        floor_std: float = HEIGHT_STD_M,
-    ) -> None:
-        self.data, self.weights, self.state = data, weights, state
-        self.contact, self.contact_weight, self.outlier, self.floor_std = contact, contact_weight, outlier, floor_std
+    probability: np.ndarray
+    weight: float
+    outlier: float = OUTLIER_SQUARE
+    floor_std: float = HEIGHT_STD_M
+
+
+class WorldResiduals:
+    """Residuals at one point."""
+
+    def __init__(self, data: WorldInput, weights: WorldWeights, state: WorldState, contacts: Contacts) -> None:
+        self.data, self.weights, self.state, self.contacts = data, weights, state, contacts
         self._see()
         self._compare_image()
         self._compare_body()
@@ -165,7 +164,7 @@ class WorldResiduals:
         pixels = focal * self.seen[..., :2] / self.depth[..., None] + centre
         self.image = np.where(data.weight[..., None] > 0, pixels - data.keypoints, 0.0)
         self.square = np.square(self.image).sum(-1) * data.weight
-        self.robust = 1.0 / (1.0 + self.square / self.outlier)
+        self.robust = 1.0 / (1.0 + self.square / self.contacts.outlier)
         self.relief = self.seen[..., 2] - self.seen[:, :1, 2] - data.depth
         self.rounded = np.sqrt(np.square(self.relief) + _DEPTH_ROUNDING_M**2)
 
@@ -183,9 +182,10 @@ class WorldResiduals:
         """Feet in contact with their place one frame before, and with the floor."""
         feet, config = self.state.joints[:, FEET], self.data.config
         self.step = feet[1:] - feet[:-1]
-        self.step_weight = self.contact_weight * self.contact / (config.contact_speed_m_s / self.data.fps) ** 2
+        touching = self.contacts.probability
+        self.step_weight = self.contacts.weight * touching / (config.contact_speed_m_s / self.data.fps) ** 2
         self.height = step_height(feet, self.state.globals[FLOOR])
-        self.height_weight = self.contact / self.floor_std**2
+        self.height_weight = touching / self.contacts.floor_std**2
 
     def _compare_camera(self) -> None:
         """The camera's errors with those one frame before, and its path with a steady flight."""
@@ -221,10 +221,7 @@ class WorldResiduals:
 
     def moved(self, frames: np.ndarray, shared: np.ndarray) -> WorldResiduals:
         """Residuals of the same cost after a step."""
-        state = self.state.moved(frames, shared)
-        return WorldResiduals(
-            self.data, self.weights, state, self.contact, self.contact_weight, self.outlier, self.floor_std
-        )
+        return WorldResiduals(self.data, self.weights, self.state.moved(frames, shared), self.contacts)
 
     def usual_outlier(self) -> float:
         """Squared residual that sets outliers apart from the rest: far from the solution all are large."""

@@ -76,7 +76,7 @@ def test_live_poses_of_unseen_people_are_near_the_offline_ones(shared, tmp_path)
 
 def test_live_poses_in_map_are_measured_beside_the_offline_ones(tmp_path):
     """With exact telemetry the refined poses in ``map`` are nearly as good as offline; the latest ones err more."""
-    truth = simulate_person(np.arange(24 * 17) / 24.0, "walk", 0, 1.75, BODY_17)
+    truth = simulate_person(np.arange(24 * 13) / 24.0, "walk", 0, 1.75, BODY_17)
     np.savez(
         tmp_path / "walk.npz", X=(1000.0 * truth[:, : len(BODY_15)]).astype(np.float32), fps=24.0,
         joints=np.array(BODY_15.joints),

@@ -41,7 +41,7 @@ class Scene:
             image[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = trousers
             image[max(y0, 0) : max(int(y), 0), max(x0, 0) : max(x1, 0)] = shirt
             boxes.append([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
-        image = np.clip(image + self.rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)
+        image += self.rng.integers(0, 15, image.shape, np.uint8)  # of a camera: as much as a deviation of 4
         boxes = np.clip(np.array(boxes, float).reshape(-1, 4), 0, [*SIZE, *SIZE])
         seen = [i for i in range(len(persons)) if i not in unseen and boxes[i, 2] - boxes[i, 0] > 8]
         boxes = boxes[seen] + self.rng.normal(0, 1.0, (len(seen), 4))

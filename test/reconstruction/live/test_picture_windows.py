@@ -95,9 +95,10 @@ def test_a_path_that_a_cut_ends_is_told_and_the_next_one_begins_at_its_place() -
 
 def test_without_texture_there_is_no_path_and_the_poses_stay_with_the_camera() -> None:
     true = flown()
+    brief = replace(true, observations=true.observations[: round(5.0 * FPS)])
     few = Background(*(values[true.background.track % 40 == 0] for values in
                        (true.background.frame, true.background.track, true.background.point)))  # fmt: skip
-    found = windows(true, lambda stamps: few.of_frames(np.searchsorted(true.stamp_ns, stamps)))
+    found = windows(brief, lambda stamps: few.of_frames(np.searchsorted(true.stamp_ns, stamps)))
     assert all(w.window.in_map is None for w in found)
     assert "too few fixed points" in found[-1].window.picture
     assert np.abs(found[-1].joints3d[:, 0]).max() < 1e-9

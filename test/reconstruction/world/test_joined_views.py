@@ -12,6 +12,7 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.joined_views import JoinedViews, joined_state, joined_weights, view_state
 from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world
 from drocap_ros.reconstruction.world.world_model import CAMERA, GLOBALS, LENGTHS, SCALE, WorldInput, WorldState
+from drocap_ros.reconstruction.world.world_residuals import Contacts
 
 
 def two_views(joints: np.ndarray) -> WorldInput:
@@ -37,7 +38,7 @@ def test_derivatives_of_all_views_are_those_of_the_cost() -> None:
         globals=np.append(state.globals[:GLOBALS], rng.normal(0, 0.02, len(state.globals) - GLOBALS)),
     )
     weights, contact = joined_weights(data), rng.random((6, 4))
-    here = JoinedViews(data, weights, state, contact, 0.2)
+    here = JoinedViews(data, weights, state, Contacts(contact, 0.2))
     by_frame, by_shared = here.gradient()
     step = 1e-6
 
@@ -63,7 +64,7 @@ def test_a_step_of_the_matrix_is_the_change_of_the_gradient() -> None:
     shared = np.zeros(GLOBALS)
     shared[LENGTHS], shared[SCALE] = data.lengths, 1.0
     state = joined_state(WorldState(joints, np.zeros((20, CAMERA)), shared), 1)
-    here = JoinedViews(data, joined_weights(data), state, np.zeros((19, 4)), 0.0)
+    here = JoinedViews(data, joined_weights(data), state, Contacts(np.zeros((19, 4)), 0.0))
     band, border, corner = here.normal_matrix()
     size = len(band)
     full = np.zeros((size, size))

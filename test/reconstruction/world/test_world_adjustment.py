@@ -36,7 +36,7 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldInput,
     WorldState,
 )
-from drocap_ros.reconstruction.world.world_residuals import WorldResiduals, gradient, weights_of
+from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, gradient, weights_of
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
@@ -100,7 +100,7 @@ def random_point() -> tuple[WorldResiduals, WorldInput, WorldState, np.ndarray]:
     shared[MISALIGNMENT], shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] = [0.03, -0.05, 0.02], [0.03, 0.02]
     state = WorldState(joints, rng.normal(0, 0.01, (7, 6)), shared)
     contact = rng.random((6, 4))
-    return WorldResiduals(data, weights_of(data), state, contact, 0.2), data, state, contact
+    return WorldResiduals(data, weights_of(data), state, Contacts(contact, 0.2)), data, state, contact
 
 
 def test_normal_matrix_holds_body_and_camera_together_by_the_first_frame_of_the_telemetry_alone() -> None:
@@ -113,7 +113,7 @@ def test_normal_matrix_holds_body_and_camera_together_by_the_first_frame_of_the_
     shared = np.zeros(GLOBALS)
     shared[LENGTHS], shared[SCALE] = data.lengths, 1.0
     weights, state = weights_of(data), WorldState(joints, np.zeros((frames, CAMERA)), shared)
-    here = WorldResiduals(data, weights, state, np.ones((frames - 1, 4)), 0.2)
+    here = WorldResiduals(data, weights, state, Contacts(np.ones((frames - 1, 4)), 0.2))
     band, _, _ = normal_matrix(here)
     for axis in (0, 1):
         along = np.zeros((frames, FRAME))
@@ -129,7 +129,7 @@ def test_derivatives_are_those_of_the_cost() -> None:
     rng, step = np.random.default_rng(1), 1e-6
 
     def cost(frames: np.ndarray, shared: np.ndarray) -> float:
-        return WorldResiduals(data, here.weights, state.moved(frames, shared), contact, 0.2).cost
+        return WorldResiduals(data, here.weights, state.moved(frames, shared), Contacts(contact, 0.2)).cost
 
     for _ in range(60):
         way = rng.normal(size=by_frame.shape)
@@ -157,14 +157,17 @@ def test_normal_matrix_is_the_curvature_of_the_quadratic_terms() -> None:
     rng = np.random.default_rng(2)
     camera = np.zeros((7, FRAME))
     camera[:, 2] = rng.normal(size=7)  # the position's error
-    moved = WorldResiduals(replace(data, weight=0 * data.weight), here.weights, state, contact, 0.2)
+    moved = WorldResiduals(replace(data, weight=0 * data.weight), here.weights, state, Contacts(contact, 0.2))
     flat, _, _ = normal_matrix(moved)
     matrix = np.zeros((size, size))
     for offset in range(flat.shape[1]):
         at = np.arange(size - offset)
         matrix[at, at + offset] = matrix[at + offset, at] = flat[: size - offset, offset]
     there = WorldResiduals(
-        replace(data, weight=0 * data.weight), here.weights, state.moved(camera, np.zeros(GLOBALS)), contact, 0.2
+        replace(data, weight=0 * data.weight),
+        here.weights,
+        state.moved(camera, np.zeros(GLOBALS)),
+        Contacts(contact, 0.2),
     )
     change = gradient(there)[0] - gradient(moved)[0]
     np.testing.assert_allclose(change.reshape(-1), matrix @ camera.reshape(-1), rtol=1e-8, atol=1e-6)
