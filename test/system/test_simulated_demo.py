@@ -75,7 +75,7 @@ def test_same_seed_gives_the_same_flight_beside_a_busy_process(tmp_path, capsys)
         out = tmp_path / name / "demo"
         with busy_processes(busy):
             assert (
-                main(["demo", "--seconds", "3", "--seed", "2", "--mount", "fixed", "--out", str(out), "--quiet"]) == 0
+                main(["demo", "--seconds", "2", "--seed", "2", "--mount", "fixed", "--out", str(out), "--quiet"]) == 0
             )
         printed.append(capsys.readouterr().out.replace(str(out), "OUT"))
         contents.append(session_contents(out / "session"))

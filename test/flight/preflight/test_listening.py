@@ -47,7 +47,7 @@ class Scene:
             listening.link.send_motion(listening.link.mav.set_position_target_local_ned_encode(0, 1, 1, 1, *[0] * 12))
         before(self)
         while not listening.done:
-            self.t += 0.005
+            self.t += 0.01
             self.step()
             listening.turn(0.0)
         self.measured = listening.measured()

@@ -18,9 +18,11 @@ from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.rotations import exp_so3, log_so3, quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
+from drocap_ros.reconstruction.live.stream_order import StreamEvent
 from drocap_ros.reconstruction.live.window import TelemetryUse
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.tracks import Tracks
@@ -29,7 +31,36 @@ S = 10**9
 ADJUSTER = BundleAdjusterConfig()
 #: Half the windows, where the last one counts.
 SELDOM = BundleAdjusterConfig(period_s=2.0)
+#: Poses of streams that were lifted before, by all their images so far, which it keeps alive.
+LIFTED: dict[int, tuple[InitialPose | None, StreamEvent, PoseObservation]] = {}
 CameraAt = Callable[[np.ndarray, tuple[int, int]], WindowCamera | None]
+
+
+class Remembering:
+    """An initializer that lifts no stream twice: telemetry, of which these tests are, does not change its poses."""
+
+    event: StreamEvent
+
+    def __init__(self, config: InitializerConfig) -> None:
+        self._config, self._past, self._key = config, list[PoseObservation](), 0
+        self._own: LiveInitializer | None = None
+
+    def push(self, observation: PoseObservation) -> InitialPose | None:
+        self._key = hash((self._key, id(observation)))
+        if self._key not in LIFTED:
+            if self._own is None:
+                self._own = LiveInitializer(self._config)
+                for earlier in self._past:
+                    self._own.push(earlier)
+            LIFTED[self._key] = self._own.push(observation), self._own.event, observation
+        self._past.append(observation)
+        pose, self.event, _ = LIFTED[self._key]
+        return pose
+
+
+@pytest.fixture(autouse=True)
+def lifted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drocap_ros.reconstruction.live.replay.LiveInitializer", Remembering)
 
 
 def run(
