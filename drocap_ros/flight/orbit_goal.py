@@ -19,14 +19,15 @@ class OrbitGoal(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """What a plan wishes, as an operator who adjusts the orbit; it is judged by the same limits.
+    """Where a plan wishes the vehicle on its orbit; it is judged as an operator who adjusts the orbit.
 
+    bearing_rad : from the subject, 0 = east, counter-clockwise from above
     until_s : monotonic time from which on it is outdated
     why : in words
     """
 
+    bearing_rad: float
     height_m: float
-    angular_speed_deg_s: float
     until_s: float
     why: str
 

@@ -8,6 +8,8 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
+HEIGHT_ROOM_M = (0.3, 0.5)  # of an orbit from min_height_m and max_height_m: the error of its height
+
 
 @dataclass(frozen=True)
 class SafetyConfig(Parameters):
@@ -91,7 +93,7 @@ class SafetyConfig(Parameters):
 
 def height_condition(config: SafetyConfig, height_m: float) -> Condition | None:
     """Whether an orbit at this height leaves too little room to the limits; None = enough."""
-    low, high = config.min_height_m + 0.3, config.max_height_m - 0.5
+    low, high = config.min_height_m + HEIGHT_ROOM_M[0], config.max_height_m - HEIGHT_ROOM_M[1]
     if low <= height_m * ROUNDING and height_m <= high * ROUNDING:
         return None
     return condition(ConditionCode.HEIGHT_OUT_OF_RANGE, value=height_m, low=low, high=high)

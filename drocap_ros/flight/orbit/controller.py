@@ -25,6 +25,7 @@ from drocap_ros.flight.orbit.flown_orbit import FlownOrbit
 from drocap_ros.flight.orbit.observer import Observer, OwnFlight
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Limits, ModeRequest, OperatorCommand, SafetyState, State
+from drocap_ros.flight.orbit.view_plan import ViewForecast
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.orbit.way_out import way_out
 from drocap_ros.flight.orbit_goal import Wish
@@ -93,6 +94,11 @@ class OrbitController:
         """Take a plan's wish, or why it has none: it counts where the orbit's plan is ``ACCURACY``."""
         with self._lock:
             self._orbit.wish = wish
+
+    def on_views(self, views: ViewForecast, now_s: float, age_s: float) -> None:
+        """Take a forecast of the views, ``age_s`` old, for a plan."""
+        with self._lock:
+            self._orbit.plan_by(views, now_s, age_s)
 
     # -- one step --------------------------------------------------------------------------------------
     def step(self, now_ns: int, now_s: float) -> ControlStatus:

@@ -24,14 +24,15 @@ from drocap_ros.flight.orbit.planner import (
     setpoint_of,
 )
 from drocap_ros.flight.orbit.states import Command, Limits, OperatorCommand, SafetyState
+from drocap_ros.flight.orbit.view_plan import ViewForecast, choose_view, planned_goal, reach_of
 from drocap_ros.flight.orbit_config import ACCURACY
 from drocap_ros.flight.orbit_goal import OrbitGoal, Wish, goal_of
+from drocap_ros.flight.safety_config import HEIGHT_ROOM_M
 from drocap_ros.flight.subject.framing import Framing
 
 _SURE_SIZES = 3.0  # of size_error, beyond which the picture contradicts the height
-_TOP_ROOM_M = 0.5  # below max_height_m, as of a goal
-NO_POSES = "no adjusted poses (pose3d/refined) have arrived"
-NO_NEWER = "no newer adjusted poses (pose3d/refined) arrive"
+NO_POSES = "no forecast of the views (pose3d/refined, in map) has come"
+NO_NEWER = "no newer forecast of the views (pose3d/refined, in map) comes"
 _FLOWN = (ConditionCode.ORBITING, ConditionCode.WIDENED, ConditionCode.SLOWED)
 
 
@@ -53,7 +54,7 @@ class FlownOrbit:
         self.unsafe: Condition | None = None
         self._reference: OrbitState | None = None
         self._shortfall = Shortfall()
-        self._framed_radius_m = 0.0
+        self._framed_radius_m = self._greatest_m_s = 0.0
 
     @property
     def place(self) -> np.ndarray | None:
@@ -75,14 +76,24 @@ class FlownOrbit:
         if isinstance(wish, str) or wish.until_s < now_s:
             self._unplanned = wish if isinstance(wish, str) else NO_NEWER
             return
-        fastest = abs(math.degrees(self.goal.angular_speed_rad_s))
-        speed = min(max(wish.angular_speed_deg_s, -fastest), fastest)
-        adjust = OperatorCommand(int(Command.ADJUST), height_m=wish.height_m, angular_speed_deg_s=speed)
+        phase, flown_s = (0.0, 0.0) if self._reference is None else (self._reference.phase, self._reference.flown_s)
+        wished = planned_goal(self.goal, wish, phase, flown_s)
+        adjust = OperatorCommand(int(Command.ADJUST), *wished[:2], math.degrees(wished.angular_speed_rad_s))
         judged = commanded_goal(self._config, adjust, self.goal, framing)
         if isinstance(judged, Condition):
             self._unplanned = str(judged)
         else:
             self._flown = judged
+
+    def plan_by(self, views: ViewForecast, now_s: float, age_s: float) -> None:
+        """Wish by a forecast that is ``age_s`` old; without an orbit there is nothing to plan."""
+        if self._reference is None or self.plan != ACCURACY:
+            return
+        config, reference = self._config, self._reference
+        reach = reach_of(config, self.goal, reference.radius.value, self._greatest_m_s)
+        place = (reference.phase, reference.height.value - config.ground_height_m)
+        former = self.wish if isinstance(self.wish, Wish) and self.wish.until_s > now_s else None
+        self.wish = choose_view(views, place, reach, former, now_s - age_s)
 
     def begin(self, seen: Observed) -> None:
         """Begin an orbit where the vehicle is."""
@@ -136,13 +147,14 @@ class FlownOrbit:
             config, subject.sd_m, speed, config.braking_m_s2, config.size_error, subject.nearer * subject.distance_m
         )
         self._framed_radius_m = framing.least_radius(self._flown, speed, seen.autopilot.gives_way_s)
+        self._greatest_m_s = coast_speed(seen, self._limits)
         return Scene(
             vehicle=seen.vehicle.position,
             subject=subject.position,
             subject_velocity=subject.velocity,
             ground_m=config.ground_height_m + self._risen_m(seen),
             least_radius_m=max(least, self._framed_radius_m),
-            greatest_speed_m_s=coast_speed(seen, self._limits),
+            greatest_speed_m_s=self._greatest_m_s,
         )
 
     def _risen_m(self, seen: Observed) -> float:
@@ -152,5 +164,5 @@ class FlownOrbit:
         """
         config, height_m = self._config, seen.vehicle.height_m
         lower = (1.0 - _SURE_SIZES * config.size_error - seen.subject.size_over_ground) * height_m
-        room_m = config.max_height_m - _TOP_ROOM_M - self._flown.height_m
+        room_m = config.max_height_m - HEIGHT_ROOM_M[1] - self._flown.height_m
         return min(lower, max(room_m, 0.0)) if lower > 0.0 else 0.0  # NaN is not
