@@ -29,6 +29,20 @@ _SIDES = ((_J["rhip"], _J["lhip"]), (_J["rknee"], _J["lknee"]), (_J["rankle"], _
           (_J["rtoe"], _J["ltoe"]))  # fmt: skip
 #: Share of the people who go from posture to posture.
 _POSED = 0.45
+#: Share of the windows whose shoulders are placed anew, as those of people: a third of the MoCap is on figures whose
+#: shoulders are 0.23 m apart.
+_SHOULDERED = 0.6
+#: Distance of the shoulders over thigh and shank, and its spread: between that of the joints' centres (0.36 m of 0.83 m)
+#: and the breadth over both acromia (0.42 m of men, 0.37 m of women: ANSUR II, 2012).
+_SHOULDERS, _SHOULDERS_SPREAD = 0.46, 0.05
+#: Height of the neck above their middle over the same (0.135 m), and its spread.
+_NECK, _NECK_SPREAD = 0.163, 0.03
+#: Share of hand-held cameras among those of unknown attitude, and their roll, rad: most below 20 degrees, up to 40.
+_HELD, _ROLL, _MOST_ROLL = 0.4, 0.26, 0.7
+#: Share of distant cameras; the nearest and farthest of the others, m.
+_DISTANT, _NEAREST_M, _FARTHEST_M = 0.4, 2.0, 30.0
+#: Spread of an assumed focal length, share of it.
+_LENS_SPREAD = 0.12
 
 
 @dataclass(frozen=True)
@@ -130,6 +144,7 @@ def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
     for (joint_name, side), k in zip(places, (0, 1, 2, 2, 3, 3), strict=True):
         across, along, high = shift[:, :, k, 0], shift[:, :, k, 1], shift[:, :, k, 2]
         bone[:, :, _J[joint_name]] += side * across * right + along * front + high * up
+    _place_shoulders(bone, right, up, rng)
 
     body = np.empty_like(bone)
     body[:, :, 0] = 0
@@ -146,6 +161,21 @@ def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
     return Bodies(body, still)
 
 
+def _place_shoulders(bone: np.ndarray, right: np.ndarray, up: np.ndarray, rng: np.random.Generator) -> None:
+    """Move the shoulders of most bones (B, T, 17, 3) to the width and height of people; the arms go along."""
+    windows = len(bone)
+    leg = np.median(np.linalg.norm(bone[:, :, [_J["rknee"], _J["rankle"]]], axis=-1).sum(axis=-1), axis=1)
+    left, other = (bone[:, :, _J[name]] for name in ("lshoulder", "rshoulder"))
+    width = np.median(((other - left) * right).sum(axis=-1), axis=1)
+    drop = np.median(-(0.5 * (other + left) * up).sum(axis=-1), axis=1)
+    chosen = rng.random(windows) < _SHOULDERED
+    wider = np.where(chosen, leg * rng.normal(_SHOULDERS, _SHOULDERS_SPREAD, windows) - width, 0.0)
+    higher = np.where(chosen, drop - leg * rng.normal(_NECK, _NECK_SPREAD, windows), 0.0)
+    for name, side in (("rshoulder", 0.5), ("lshoulder", -0.5)):
+        shift = side * wider[:, None, None] * right + higher[:, None, None] * up
+        bone[:, :, _J[name]] += shift.astype(np.float32)
+
+
 def camera_rotation(azimuth: np.ndarray, elevation: np.ndarray, roll: np.ndarray) -> np.ndarray:
     """(..., 3, 3) world (z up) -> camera (x right, y down, z forward), towards the origin from a direction, rolled."""
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
@@ -160,35 +190,51 @@ def camera_rotation(azimuth: np.ndarray, elevation: np.ndarray, roll: np.ndarray
 def _orbit(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
     """(B, T, 3, 3) rotations of orbiting cameras: still, slow and fast, both ways, of every height."""
     kind = rng.random(windows)
-    speed = np.where(kind < 0.15, 0, np.where(kind < 0.35, rng.uniform(0, 12, windows), rng.uniform(8, 60, windows)))
+    speed = np.where(kind < 0.25, 0, np.where(kind < 0.4, rng.uniform(0, 12, windows), rng.uniform(8, 60, windows)))
     speed = np.radians(speed) / LIFTER_FPS * rng.choice([-1, 1], windows)
     wobble = slow(rng, windows, frames, (3,)) * (rng.random((windows, 1, 1)) < 0.7)
     time = np.arange(frames)
     azimuth = rng.uniform(0, 2 * np.pi, (windows, 1)) + speed[:, None] * time + 0.03 * wobble[..., 0]
-    level = np.where(rng.random(windows) < 0.65, rng.normal(0.33, 0.17, windows), rng.uniform(-0.3, 1.3, windows))
+    # Drones, phones at the height of a chest, and all others.
+    view = rng.random(windows)
+    level = np.where(view < 0.5, rng.normal(0.33, 0.17, windows), rng.normal(0.05, 0.12, windows))
+    level = np.where(view < 0.7, level, rng.uniform(-0.3, 1.3, windows))
     elevation = np.clip(level, -0.35, 1.3)[:, None] + 0.03 * wobble[..., 1]
     return camera_rotation(azimuth, elevation, 0.04 * wobble[..., 2]).astype(np.float32)
 
 
-def _known_rotation(rotation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """What a gimbal reports: turned by 1.5 degrees and slowly wandering; NaN in half of the windows."""
+def _rolled(rotation: np.ndarray, known: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Rotations (B, T, 3, 3) with the roll of hand-held cameras in some windows; where it is known it is taken away."""
+    windows = len(rotation)
+    held = ~known & (rng.random(windows) < _HELD)
+    roll = np.where(held, np.clip(_ROLL * rng.standard_normal(windows), -_MOST_ROLL, _MOST_ROLL), 0.0)
+    about_axis = np.zeros((windows, 1, 3))
+    about_axis[..., 2] = roll[:, None]
+    rolled: np.ndarray = (exp_so3(about_axis) @ rotation).astype(np.float32)
+    return rolled
+
+
+def _known_rotation(rotation: np.ndarray, known: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What a gimbal reports: turned by 1.5 degrees and slowly wandering; NaN where it is not ``known`` (B,)."""
     windows, frames = rotation.shape[:2]
     error = 0.026 * rng.standard_normal((windows, 1, 3)) + 0.006 * slow(rng, windows, frames, (3,))
     reported: np.ndarray = exp_so3(error) @ rotation
-    reported[rng.random(windows) < 0.5] = np.nan
+    reported[~known] = np.nan
     return reported
 
 
 def _project(bodies: Bodies, rng: np.random.Generator) -> Batch:
     body = bodies.joints
     windows, frames = body.shape[:2]
-    rotation = _orbit(rng, windows, frames)
+    known = rng.random(windows) < 0.5
+    rotation = _rolled(_orbit(rng, windows, frames), known, rng)
     seen = np.einsum("btij,btpj->btpi", rotation, body, optimize=True)
     drawn = np.einsum("btij,btpj->btpi", rotation, as_drawn(body, rng), optimize=True)
 
-    # Half of the cameras are orthographic; the others are 3-30 m away, and the distance drifts.
-    away = np.exp(rng.uniform(np.log(3), np.log(30), (windows, 1))) * (1 + 0.05 * slow(rng, windows, frames, ()))
-    inverse = np.where(rng.random((windows, 1)) < 0.5, 0, 1 / away).astype(np.float32)
+    # Many cameras are orthographic; the distance of the others drifts.
+    away = np.exp(rng.uniform(np.log(_NEAREST_M), np.log(_FARTHEST_M), (windows, 1)))
+    away = np.maximum(away * (1 + 0.05 * slow(rng, windows, frames, ())), 0.9 * _NEAREST_M)
+    inverse = np.where(rng.random((windows, 1)) < _DISTANT, 0, 1 / away).astype(np.float32)
     zoom = np.where(inverse > 0, inverse / np.maximum(inverse.mean(axis=1, keepdims=True), 1e-6), 1).astype(np.float32)
 
     def image(points: np.ndarray) -> np.ndarray:
@@ -199,13 +245,15 @@ def _project(bodies: Bodies, rng: np.random.Generator) -> Batch:
     found = detect(image(drawn), rng)
     # At the mean distance a length in metres is a share of the focal length.
     focal = np.where(inverse[:, 0] > 0, 1 / np.maximum(inverse.mean(axis=1), 1e-6), np.inf)
+    # Some lenses are assumed by the make of the camera.
+    focal *= np.exp(np.where(rng.random(windows) < 0.4, _LENS_SPREAD, 0.0) * rng.standard_normal(windows))
     focal[rng.random(windows) < 0.5] = np.nan
     features, centre, scale = normalise(
         found.keypoints,
         found.confidence,
         _estimated_lengths(truth, rng),
         found.covariance,
-        _known_rotation(rotation, rng),
+        _known_rotation(rotation, known, rng),
         focal,
     )
     truth[..., :2] -= centre[:, :, None]

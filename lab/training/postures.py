@@ -47,6 +47,7 @@ class Kind(NamedTuple):
 
 
 _ARMS_FREE = {"shoulder": (-0.4, 0.9), "shoulder_out": (-0.1, 0.7), "arm_turn": (-1.0, 0.3), "elbow": (0.0, 1.3)}
+_ARMS_CROSSED = {"shoulder": (0.0, 0.8), "shoulder_out": (-0.1, 0.4), "arm_turn": (-1.7, -0.7), "elbow": (1.2, 2.3)}
 _ARMS_DOWN = {"arm": (-0.4, 0.4), "shoulder_out": (-0.1, 0.5), "elbow": (-0.1, 0.4)}
 _KNEELING = {"knee": (1.3, 2.0), "ankle": (-1.2, 0.6)}
 _LYING = {
@@ -57,7 +58,8 @@ _LYING = {
 KINDS = (
     Kind(0, {}),
     Kind(0, {"pitch": (-0.2, 0.2), "bend": (-0.2, 0.3), "twist": (-0.6, 0.6), **_ARMS_FREE}),
-    # Bent, crouching, on one knee, on a chair.
+    Kind(0, {"pitch": (-0.2, 0.2), "bend": (-0.2, 0.3), "twist": (-0.4, 0.4), **_ARMS_CROSSED}),
+    # Bent, crouching, on one knee, on a chair, also with crossed arms.
     Kind(1, {"pitch": (-1.1, -0.1), "bend": (0.2, 1.2), "lean": (-0.3, 0.3), "thigh": (-0.2, 0.7), "knee": (0.0, 1.2),
              "1:arm": (-0.3, 0.9), "2:arm": (-0.8, 0.8), "elbow": (0.0, 0.6)}),
     Kind(1, {"pitch": (-0.7, 0.2), "bend": (0.0, 0.9), "twist": (-0.3, 0.3), "thigh": (0.7, 2.0),
@@ -68,6 +70,8 @@ KINDS = (
              "hip_turn": (-0.2, 0.7), "1:shoulder": (0.0, 1.4), "2:shoulder": (-0.3, 1.2), "elbow": (0.0, 1.0)}),
     Kind(1, {"pitch": (-0.3, 0.4), "bend": (-0.1, 0.7), "thigh": (1.2, 1.7), "hip_out": (-0.2, 0.3),
              "hip_turn": (-0.2, 0.6), "knee": (0.9, 1.9), **_ARMS_FREE}),
+    Kind(1, {"pitch": (-0.3, 0.4), "bend": (-0.1, 0.7), "thigh": (1.2, 1.7), "hip_out": (-0.2, 0.3),
+             "hip_turn": (-0.2, 0.4), "knee": (1.1, 1.9), **_ARMS_CROSSED}),
     # Deep down with a hand on the floor or near it, on both feet or with one foot far ahead.
     Kind(1, {"pitch": (-1.0, 0.1), "roll": (-0.1, 0.4), "bend": (0.0, 0.9), "lean": (-0.2, 0.6), "twist": (-0.5, 0.5),
              "thigh": (1.0, 2.3), "hip_out": (-0.4, 0.5), "hip_turn": (-0.2, 1.5), "knee": (1.6, 2.6),
