@@ -69,7 +69,7 @@ def as_drawn(body: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     drawn[:, :, _places("neck", "head")] += np.array([[0.02], [0.03]], np.float32) * head
     trunk = body[:, :, _J["neck"]] - body[:, :, _J["pelvis"]]
     drawn[:, :, _places("lshoulder", "rshoulder")] += (0.04 * _normal(rng, windows) * biased * trunk)[:, :, None]
-    # Shoulders are drawn inside their centres by a tenth or more; a map that widens them leaves an error of either sign.
+    # Shoulders are drawn inside their centres; the map that widens them leaves an error of either sign.
     for pair, wider, spread in (("shoulder", 0.0, 0.1), ("hip", 0.1, 0.15)):
         line = 0.5 * (body[:, :, _J["r" + pair]] - body[:, :, _J["l" + pair]])
         outwards = (wider + spread * _normal(rng, windows)) * biased * line

@@ -32,8 +32,8 @@ _POSED = 0.45
 #: Share of the windows whose shoulders are placed anew, as those of people: a third of the MoCap is on figures whose
 #: shoulders are 0.23 m apart.
 _SHOULDERED = 0.6
-#: Distance of the shoulders over thigh and shank, and its spread: between that of the joints' centres (0.36 m of 0.83 m)
-#: and the breadth over both acromia (0.42 m of men, 0.37 m of women: ANSUR II, 2012).
+#: Distance of the shoulders over thigh and shank, and its spread: between that of the joints' centres (0.36 m of
+#: 0.83 m) and the breadth over both acromia (0.42 m of men, 0.37 m of women: ANSUR II, 2012).
 _SHOULDERS, _SHOULDERS_SPREAD = 0.46, 0.05
 #: Height of the neck above their middle over the same (0.135 m), and its spread.
 _NECK, _NECK_SPREAD = 0.163, 0.03
