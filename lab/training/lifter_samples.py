@@ -41,6 +41,8 @@ _NECK, _NECK_SPREAD = 0.163, 0.03
 _HELD, _ROLL, _MOST_ROLL = 0.4, 0.26, 0.7
 #: Share of distant cameras; the nearest and farthest of the others, m.
 _DISTANT, _NEAREST_M, _FARTHEST_M = 0.4, 2.0, 30.0
+#: Least distance of a joint from the camera, share of the pelvis'.
+_NEAREST_SHARE = 0.2
 #: Spread of an assumed focal length, share of it.
 _LENS_SPREAD = 0.12
 
@@ -238,7 +240,9 @@ def _project(bodies: Bodies, rng: np.random.Generator) -> Batch:
     zoom = np.where(inverse > 0, inverse / np.maximum(inverse.mean(axis=1, keepdims=True), 1e-6), 1).astype(np.float32)
 
     def image(points: np.ndarray) -> np.ndarray:
-        flat: np.ndarray = points[..., :2] / (1 + inverse[..., None, None] * points[..., 2:]) * zoom[..., None, None]
+        # Of those who lie, hands may reach the camera.
+        distance = np.maximum(1 + inverse[..., None, None] * points[..., 2:], _NEAREST_SHARE)
+        flat: np.ndarray = points[..., :2] / distance * zoom[..., None, None]
         return flat
 
     truth = np.concatenate([image(seen), seen[..., 2:] * zoom[..., None, None]], axis=-1)

@@ -77,7 +77,8 @@ def test_length_and_reach_features_agree_with_the_truth():
     true = np.median(np.linalg.norm(span, axis=-1), axis=1)
     np.testing.assert_allclose(np.median(length[given, 0] / true[given]), 1.0, atol=0.02)
     shown = reach[given] > 0
-    assert np.median(np.abs(reach[given] - np.abs(span[given][..., 2]))[shown]) < 0.15
+    # Joints are drawn aside by a tenth of the size, shoulders and hips by more.
+    assert np.median(np.abs(reach[given] - np.abs(span[given][..., 2]))[shown]) < 0.2
 
 
 def test_known_camera_turns_and_gravity_agree_with_the_poses():
