@@ -111,7 +111,7 @@ def camera_from_points(
 
 def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> PictureCamera:
     """The path of a camera that moves: grown from a pair, or all at once where it moves little."""
-    starts = _starts(sightings, camera, fps, key_hz)
+    starts = _starts(sightings, camera, key_hz)
     if not starts:
         return replace(camera, kind=Kind.NOTHING_FIXED)
     least = min(start.path.residual_px for _, start in starts)
@@ -152,18 +152,18 @@ def _grown(sightings: Sightings, camera: PictureCamera, start: Growth, fps: floa
     return _checked(of_path, found)
 
 
-def _starts(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> list[tuple[float, Growth]]:
+def _starts(sightings: Sightings, camera: PictureCamera, key_hz: float) -> list[tuple[float, Growth]]:
     """Paths of some keyframes about every promising pair, with its parallax (rad), those that tell most first."""
     growths: list[tuple[Pair, Growth]] = []
+    enough = min(_COMPARED, int(_LEAST_KNOWN * len(sightings)))
     for factor in _FOCAL_STARTS if camera.focal_std else (1.0,):
         matrix = with_focal(camera.matrix, factor)
         for pair in candidate_pairs(sightings, matrix, key_hz):
             start = begin(sightings, pair, matrix)
             if start is not None:
-                growth = Growth(sightings, start, fps, camera.focal_std)
+                growth = Growth(sightings, start, key_hz, camera.focal_std)
                 growth.grow(_COMPARED)
                 growths.append((pair, growth))
-    enough = min(_COMPARED, int(_LEAST_KNOWN * len(sightings)))
     growths.sort(key=lambda entry: -entry[0].score)
     return [(pair.parallax, growth) for pair, growth in growths if growth.path.known.sum() >= enough]
 

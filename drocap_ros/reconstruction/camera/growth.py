@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.geometry.rotations import exp_so3, log_so3
-from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
+from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path, improved_path
 from drocap_ros.reconstruction.camera.path_model import FOCAL, PathConfig, PathInput
+from drocap_ros.reconstruction.camera.resection import LEAST_POINTS, resected
 from drocap_ros.reconstruction.camera.sightings import Sightings, rays, turn_between
 from drocap_ros.reconstruction.camera.views import Views, triangulate
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
@@ -26,8 +27,6 @@ _ENOUGH_PARALLAX = 0.1
 _NEARER = 75
 #: Distance (px) of a point from its epipolar line or its projection within which it supports a camera.
 _INLIER_PX = 2.0
-#: Points that place a keyframe, at least.
-_LEAST_PLACED = 10
 #: Steps of an adjustment while the path grows, and of the last one.
 _STEPS_WHILE_GROWING = 5
 LAST_STEPS = 12
@@ -102,7 +101,7 @@ def begin(sightings: Sightings, pair: Pair, matrix: np.ndarray) -> Grown | None:
     if essential is None or essential.shape != (3, 3):
         return None
     count, turn, shift, _ = cv2.recoverPose(essential, first, second, np.eye(3), mask=inside)
-    if count < _LEAST_PLACED:
+    if count < LEAST_POINTS:
         return None
     keys = len(sightings)
     rotation, position, known = np.tile(np.eye(3), (keys, 1, 1)), np.zeros((keys, 3)), np.zeros(keys, bool)
@@ -114,8 +113,8 @@ def begin(sightings: Sightings, pair: Pair, matrix: np.ndarray) -> Grown | None:
 class Growth:
     """A path that grows: every known keyframe adds to the points, which place the next one."""
 
-    def __init__(self, sightings: Sightings, start: Grown, fps: float, focal_std: float) -> None:
-        self.sightings, self.path, self.fps, self.focal_std = sightings, start, fps, focal_std
+    def __init__(self, sightings: Sightings, start: Grown, key_hz: float, focal_std: float) -> None:
+        self.sightings, self.path, self.key_hz, self.focal_std = sightings, start, key_hz, focal_std
         self._gather()
 
     def grow(self, most: int) -> Grown:
@@ -143,7 +142,7 @@ class Growth:
             return inside
         for gap in range(1, _GAP + 1):
             keys = [key for key in (low - gap, high + gap) if 0 <= key < len(self.sightings)]
-            if any(self._matches(key)[0].sum() >= _LEAST_PLACED for key in keys):
+            if any(self._matches(key)[0].sum() >= LEAST_POINTS for key in keys):
                 return keys
         return []
 
@@ -154,39 +153,32 @@ class Growth:
 
     def _place(self, key: int) -> bool:
         """Place a keyframe by the points it sees; whether enough of them agree."""
-        import cv2
-
         usable, piece, point = self._matches(key)
-        if usable.sum() < _LEAST_PLACED:
+        if usable.sum() < LEAST_POINTS:
             return False
-        rotation, position = self._predicted(key)
-        places, pixels = self.places[piece[usable]], np.ascontiguousarray(point[usable])
-        guess = cv2.Rodrigues(rotation)[0], np.ascontiguousarray((-rotation @ position)[:, None])
-        found, turn, shift, inside = cv2.solvePnPRansac(
-            np.ascontiguousarray(places), pixels, self.path.matrix, None, *guess,
-            useExtrinsicGuess=True, iterationsCount=200, reprojectionError=2 * _INLIER_PX, confidence=0.999,
-            flags=cv2.SOLVEPNP_ITERATIVE,
-        )  # fmt: skip
-        if not found or inside is None or len(inside) < max(_LEAST_PLACED, 0.4 * int(usable.sum())):
+        found = resected(self.places[piece[usable]], point[usable], self.path.matrix, *self._predicted(key))
+        if found is None:
             return False
-        rotation = cv2.Rodrigues(turn)[0]
-        self.path.rotation[key], self.path.position[key] = rotation, -rotation.T @ shift[:, 0]
+        self.path.rotation[key], self.path.position[key] = found
         self.path.known[key] = True
         self._add(key)
         self._solve(piece)
         return True
 
     def _predicted(self, key: int) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest known keyframe's pose: the next one differs little."""
+        """The nearest known keyframe's pose, turned by the common points and moved on as before."""
         known = np.flatnonzero(self.path.known)
         near = int(known[np.argmin(np.abs(known - key))])
         both = self.sightings.common(near, key)
         rotation = self.path.rotation[near]
-        if len(both.piece) >= _LEAST_PLACED:
+        if len(both.piece) >= LEAST_POINTS:
             rotation = (
                 turn_between(rays(both.first, self.path.matrix), rays(both.second, self.path.matrix))[0] @ rotation
             )
-        return rotation, self.path.position[near]
+        other = 2 * near - key
+        steady = 0 <= other < len(self.path.known) and bool(self.path.known[other])
+        step = self.path.position[near] - self.path.position[other] if steady else 0.0
+        return rotation, self.path.position[near] + step
 
     def _gather(self) -> None:
         """The points of all known keyframes anew."""
@@ -220,22 +212,23 @@ class Growth:
         deep = value[:, 1] > 30.0 * np.maximum(value[:, 0], 1e-30)
         self.usable[piece] = (self._count[piece] >= 2) & agree & near & deep
 
-    def adjust(self) -> AdjustedPath | None:
-        """Adjust what is known, and take it over."""
+    def adjust(self) -> None:
+        """Adjust what is known, at the keyframes alone, and take it over."""
         known = np.flatnonzero(self.path.known)
-        found = adjusted(self.sightings, self.path, self.fps, self.focal_std, _STEPS_WHILE_GROWING)
-        if found is None:
-            return None
-        frames = self.sightings.frames[known] - self.sightings.frames[known[0]]
+        keys = np.arange(len(self.sightings))
+        data = _problem(self.sightings.at_keys, keys, self.path, self.key_hz, self.focal_std)
+        if data is None:
+            return
+        found, _, _ = improved_path(replace(data, config=replace(data.config, iterations=_STEPS_WHILE_GROWING)))
         rotation, position = self.path.rotation.copy(), self.path.position.copy()
-        rotation[known], position[known] = found.rotation[frames], found.position[frames]
-        focal = float(np.exp(found.shared[FOCAL]))
+        rotation[known], position[known] = found.rotation[known - known[0]], found.position[known - known[0]]
+        focal = float(np.exp(found.state.shared[FOCAL]))
         matrix = self.path.matrix * np.array([[focal, 1.0, 1.0], [1.0, focal, 1.0], [1.0, 1.0, 1.0]])
         # The way is the unit: what an adjustment shrinks grows back.
         scale = max(float(np.linalg.norm(np.ptp(position[known], axis=0))), 1e-9)
-        self.path = Grown(rotation, position / scale, self.path.known, matrix, found.residual_px)
+        residual_px = float(np.median(np.linalg.norm(found.image, axis=1)))
+        self.path = Grown(rotation, position / scale, self.path.known, matrix, residual_px)
         self._gather()
-        return found
 
 
 def with_ends(sightings: Sightings, path: Grown) -> Grown:
@@ -299,7 +292,13 @@ def free_config(unit: float, focal_std: float) -> PathConfig:
 
 def adjusted(sightings: Sightings, path: Grown, fps: float, focal_std: float, iterations: int) -> AdjustedPath | None:
     """The core's adjustment of a grown path, over the frames from its first known keyframe to the last one."""
-    views, keys, known = sightings.views, sightings.frames, np.flatnonzero(path.known)
+    data = _problem(sightings.views, sightings.frames, path, fps, focal_std)
+    return None if data is None else adjust_path(replace(data, config=replace(data.config, iterations=iterations)))
+
+
+def _problem(views: Views, keys: np.ndarray, path: Grown, fps: float, focal_std: float) -> PathInput | None:
+    """The adjustment of a grown path, whose keyframes are the frames ``keys`` (K,) of the views; None = no points."""
+    known = np.flatnonzero(path.known)
     begin_at, end = int(keys[known[0]]), int(keys[known[-1]]) + 1
     rotation, position = between(keys[known] - begin_at, path.rotation[known], path.position[known])
     inside = (views.frame >= begin_at) & (views.frame < end)
@@ -318,8 +317,7 @@ def adjusted(sightings: Sightings, path: Grown, fps: float, focal_std: float, it
     way = max(float(np.linalg.norm(np.ptp(position, axis=0))), 1e-9)
     points = triangulate(part, rotation, position / way, path.matrix)
     unit = way * float(np.median(np.linalg.norm(points[:, :3], axis=1) / np.maximum(np.abs(points[:, 3]), 1e-3)))
-    config = replace(free_config(unit, focal_std), iterations=iterations)
-    return adjust_path(PathInput(CameraTelemetry(rotation, position, fps), path.matrix, part, config))
+    return PathInput(CameraTelemetry(rotation, position, fps), path.matrix, part, free_config(unit, focal_std))
 
 
 def between(frames: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

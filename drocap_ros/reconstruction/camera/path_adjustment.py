@@ -101,8 +101,17 @@ def adjust_path(data: PathInput, start: PathState | None = None, horizon: float 
     if not len(views.frame):
         return None
     every, data = replace(data, views=data.views.of(kept)), replace(data, views=views)
-    weights = weights_of(data)
-    here = PathResiduals(data, weights, initial_state(data, start, horizon), OUTLIER_SQUARE)
+    here, done, stop = improved_path(data, start, horizon)
+    posterior = posterior_of(here)
+    final = with_rest(PathResiduals(every, here.weights, here.state, here.usual_outlier()))
+    return _solution(final, posterior, done, stop)
+
+
+def improved_path(
+    data: PathInput, start: PathState | None = None, horizon: float = _HORIZON
+) -> tuple[PathResiduals, int, str]:
+    """The steps of :func:`adjust_path` alone: where they end, how many there were, and why they ended."""
+    here = PathResiduals(data, weights_of(data), initial_state(data, start, horizon), OUTLIER_SQUARE)
     stop, done, damping = ITERATIONS, 0, _FIRST_DAMPING
     for _ in range(data.config.iterations):
         done += 1
@@ -116,9 +125,7 @@ def adjust_path(data: PathInput, start: PathState | None = None, horizon: float 
         if falls <= _CONVERGED and here.outlier >= 0.9 * before:
             stop = CONVERGED
             break
-    posterior = posterior_of(here)
-    final = with_rest(PathResiduals(every, weights, here.state, here.usual_outlier()))
-    return _solution(final, posterior, done, stop)
+    return here, done, stop
 
 
 def _improved(here: PathResiduals, damping: float) -> tuple[PathResiduals | None, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +32,14 @@ class Sightings:
         order, _ = views.by_frame
         bounds = np.searchsorted(views.frame[order], np.stack([frames, frames + 1]))
         self.rows = [order[begin:end] for begin, end in bounds.T.tolist()]
+
+    @cached_property
+    def at_keys(self) -> Views:
+        """The views at the keyframes alone, as frames 0 to K - 1."""
+        key = np.full(self.views.frames, -1)
+        key[self.frames] = np.arange(len(self))
+        views, _ = self.views.at_frames(key >= 0)
+        return replace(views, frame=key[views.frame], frames=len(self))
 
     def __len__(self) -> int:
         return len(self.frames)

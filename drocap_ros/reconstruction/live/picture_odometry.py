@@ -195,7 +195,7 @@ def _grown(seen: _Seen, last: Tracks, stamp_ns: np.ndarray) -> tuple[np.ndarray,
     rotation[known], position[known] = last.camera_rotation[theirs], last.camera_position[theirs]
     if known.sum() < 2:
         return None
-    growth = Growth(seen.sightings, Grown(rotation, position, known, last.camera_matrix), seen.fps, 0.0)
+    growth = Growth(seen.sightings, Grown(rotation, position, known, last.camera_matrix), 1.0 / seen.knots.step_s, 0.0)
     while not growth.path.known.all() and growth.extend():
         pass
     path = growth.path
