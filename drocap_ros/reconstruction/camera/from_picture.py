@@ -10,15 +10,14 @@ from drocap_ros.geometry.pinhole import centred_camera
 from drocap_ros.reconstruction.camera.growth import (
     LAST_STEPS,
     Growth,
-    Pair,
     adjusted,
     begin,
-    candidate_pairs,
     small_motion,
     turns,
     with_ends,
 )
 from drocap_ros.reconstruction.camera.kinds import Kind, kind_of, turning_focal
+from drocap_ros.reconstruction.camera.pairs import ENOUGH_PARALLAX, Pair, candidate_pairs
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
 from drocap_ros.reconstruction.camera.path_model import FOCAL, Knots, PathConfig, PathInput
 from drocap_ros.reconstruction.camera.sightings import Sightings
@@ -122,7 +121,7 @@ def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: flo
         # Where there is little parallax any path fits: of starts that fit as well the one with the most of it counts.
         start = next(start for _, start in starts if start.path.residual_px <= _AS_GOOD * least)
         grown = _grown(sightings, camera, start, fps)
-        if small is None and grown.residual_px > _WORSE * least:
+        if small is None and starts[0][0] < ENOUGH_PARALLAX and grown.residual_px > _WORSE * least:
             small = _small_motion(sightings, camera, fps, _AS_GOOD * least)
         if small is None or grown.residual_px <= small.residual_px:
             return grown

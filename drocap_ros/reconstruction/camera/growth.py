@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.geometry.rotations import exp_so3, log_so3
+from drocap_ros.reconstruction.camera.ground_plane import largest_plane
+from drocap_ros.reconstruction.camera.pairs import Pair
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path, improved_path
 from drocap_ros.reconstruction.camera.path_model import FOCAL, PathConfig, PathInput
 from drocap_ros.reconstruction.camera.resection import LEAST_POINTS, resected
@@ -15,16 +16,6 @@ from drocap_ros.reconstruction.camera.sightings import Sightings, rays, turn_bet
 from drocap_ros.reconstruction.camera.views import Views, triangulate
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 
-#: Times (s) between the keyframes of a pair, and how many places of a recording are tried.
-_PAIR_S = (0.5, 1.0, 2.0, 3.0)
-_PLACES = 12
-#: Points that both keyframes of a pair see, at least, and pairs that are tried.
-_LEAST_COMMON = 16
-_PAIRS = 3
-#: Parallax (rad) above which more helps no pair: six degrees.
-_ENOUGH_PARALLAX = 0.1
-#: Percentile of the points' parallaxes that counts.
-_NEARER = 75
 #: Distance (px) of a point from its epipolar line or its projection within which it supports a camera.
 _INLIER_PX = 2.0
 #: Steps of an adjustment while the path grows, and of the last one.
@@ -38,6 +29,11 @@ _GAP = 8
 #: Acceleration (heights of the camera per s^2) of a camera that moves little, and steps of its adjustment.
 _SMALL_ACCELERATION = 0.3
 _SMALL_STEPS = 25
+#: Parallax (rad) below which a point's depth is the noise's: 2 degrees, of tracks that err by 0.05.
+_LITTLE_PARALLAX = 0.035
+#: Angle (degrees) of the ground from the usual image's horizontal, and distance of its points over the camera's height.
+_TILTED_DEG = 60.0
+_FARTHEST_GROUND = 20.0
 #: Depth of a point over the camera's way beyond which it places no camera.
 _FARTHEST = 200.0
 
@@ -54,39 +50,6 @@ class Grown:
     known: np.ndarray
     matrix: np.ndarray
     residual_px: float = float("inf")
-
-
-class Pair(NamedTuple):
-    """Two keyframes, the parallax (rad) of the nearer points, and how much it tells."""
-
-    first: int
-    second: int
-    parallax: float
-    score: float
-
-
-def candidate_pairs(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> list[Pair]:
-    """Pairs with much parallax and many common points, best first."""
-    found: list[Pair] = []
-    for lag_s in _PAIR_S:
-        lag = max(round(lag_s * key_hz), 1)
-        if lag >= len(sightings):
-            continue
-        for first in np.unique(np.linspace(0, len(sightings) - 1 - lag, _PLACES).astype(int)).tolist():
-            both = sightings.common(first, first + lag)
-            if len(both.piece) < _LEAST_COMMON:
-                continue
-            _, angle = turn_between(rays(both.first, matrix), rays(both.second, matrix))
-            # What is far shows none: that of the nearer points tells.
-            parallax = float(np.percentile(angle, _NEARER))
-            score = min(parallax, _ENOUGH_PARALLAX) * float(np.sqrt(len(both.piece)))
-            found.append(Pair(first, first + lag, parallax, score))
-    found.sort(key=lambda pair: -pair.score)
-    apart: list[Pair] = []
-    for pair in found:
-        if all(abs(pair.first - other.first) > key_hz for other in apart):
-            apart.append(pair)
-    return apart[:_PAIRS]
 
 
 def begin(sightings: Sightings, pair: Pair, matrix: np.ndarray) -> Grown | None:
@@ -120,7 +83,7 @@ class Growth:
     def grow(self, most: int) -> Grown:
         """Place keyframes on both sides until ``most`` are known or no more can be placed; adjust now and then."""
         due = _FIRST_KEYS
-        while int(self.path.known.sum()) < most and self.extend():
+        while int(self.path.known.sum()) < most and (self.extend() or self._on_ground()):
             if self.path.known.sum() >= due:
                 self.adjust()
                 due = int(_GROWTH * self.path.known.sum())
@@ -132,6 +95,23 @@ class Growth:
         """Place the next keyframes by the points of the known ones; whether any could be placed."""
         placed = [self._place(key) for key in self._next_keys()]
         return any(placed)
+
+    def _on_ground(self) -> bool:
+        """Place the next keyframes by points that are taken to lie on the ground; whether any could be placed.
+
+        A camera that hovers sees points without depth, and a path ends there; most of what it sees is ground.
+        """
+        known = self.path.known
+        flat = np.linalg.norm(self._ray - self._first, axis=1) < _LITTLE_PARALLAX
+        up = -self.path.rotation[known, 1].mean(axis=0)
+        ground = largest_plane(self.places[self.usable & ~flat], self.path.position[known], up, _TILTED_DEG)
+        if ground is None:
+            return False
+        height, falls = self._eye @ ground.up - ground.level, -self._ray @ ground.up
+        lying = (self._count > 0) & flat & (height > 0.0) & (falls > 1.0 / _FARTHEST_GROUND)
+        away = (height[lying] / falls[lying])[:, None]
+        self.places[lying], self.usable[lying] = self._eye[lying] + away * self._ray[lying], True
+        return self.extend()
 
     def _next_keys(self) -> list[int]:
         """Keyframes to try: those inside a pair first, then the next ones outside, or beyond a gap."""
@@ -185,6 +165,8 @@ class Growth:
         pieces = len(self.sightings.views.track)
         self._square, self._count = np.zeros((pieces, 4, 4)), np.zeros(pieces, int)
         self.places, self.usable = np.zeros((pieces, 3)), np.zeros(pieces, bool)
+        #: Where each point was last seen from, the direction there, and the first one.
+        self._eye, self._ray, self._first = np.zeros((3, pieces, 3))
         for key in np.flatnonzero(self.path.known).tolist():
             self._add(key)
         self._solve(np.arange(pieces))
@@ -196,6 +178,9 @@ class Growth:
         camera = np.concatenate([rotation, -(rotation @ position)[:, None]], axis=1)
         rows = camera[:2] - plane[..., None] * camera[2]
         self._square[piece] += np.swapaxes(rows, 1, 2) @ rows
+        self._eye[piece], self._ray[piece] = position, rays(point, self.path.matrix) @ rotation
+        new = piece[self._count[piece] == 0]
+        self._first[new] = self._ray[new]
         self._count[piece] += 1
 
     def _solve(self, piece: np.ndarray) -> None:

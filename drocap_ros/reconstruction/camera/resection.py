@@ -24,18 +24,8 @@ def resected(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Rotation (3, 3) world -> camera and position (3,) that points (N, 3) at (N, 2) px agree with; None = none.
 
-    From the expected ``rotation`` and ``position``; where these lead nowhere, from five points at a time.
+    Robust Gauss-Newton steps from the expected ``rotation`` and ``position``.
     """
-    found = _by_steps(places, pixels, matrix, rotation, position)
-    if found is None:
-        found = _by_samples(places, pixels, matrix, rotation, position)
-    return found
-
-
-def _by_steps(
-    places: np.ndarray, pixels: np.ndarray, matrix: np.ndarray, rotation: np.ndarray, position: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Robust Gauss-Newton steps."""
     focal, before = np.diagonal(matrix)[:2], np.inf
     for _ in range(_STEPS):
         seen = (places - position) @ rotation.T
@@ -64,26 +54,4 @@ def _by_steps(
             return None
         position, rotation = position + step[:3], exp_so3(step[3:]) @ rotation
     agree = (square < AGREES_PX**2) & (seen[:, 2] > 0.0)
-    return (rotation, position) if agree.sum() >= _enough(places) else None
-
-
-def _by_samples(
-    places: np.ndarray, pixels: np.ndarray, matrix: np.ndarray, rotation: np.ndarray, position: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """RANSAC."""
-    import cv2
-
-    guess = cv2.Rodrigues(rotation)[0], np.ascontiguousarray((-rotation @ position)[:, None])
-    found, turn, shift, inside = cv2.solvePnPRansac(
-        np.ascontiguousarray(places), np.ascontiguousarray(pixels), matrix, None, *guess,
-        useExtrinsicGuess=True, iterationsCount=200, reprojectionError=AGREES_PX, confidence=0.999,
-        flags=cv2.SOLVEPNP_ITERATIVE,
-    )  # fmt: skip
-    if not found or inside is None or len(inside) < _enough(places):
-        return None
-    rotation = cv2.Rodrigues(turn)[0]
-    return rotation, -rotation.T @ shift[:, 0]
-
-
-def _enough(places: np.ndarray) -> float:
-    return max(LEAST_POINTS, _LEAST_SHARE * len(places))
+    return (rotation, position) if agree.sum() >= max(LEAST_POINTS, _LEAST_SHARE * len(places)) else None

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.contacts import ANKLES, rest_likelihood
+from drocap_ros.reconstruction.camera.ground_plane import LEAST_ON_PLANE, largest_plane
 from drocap_ros.reconstruction.world.metric_scale import estimate_scale
 from drocap_ros.skeleton import BODY_17
 
@@ -25,9 +26,6 @@ _CONTACT_STDS = 3.0
 _GUESS_STD = 0.7
 #: Deviation of the scale below which contacts measure it.
 _FEET_TELL = 0.05
-#: Planes through three points that are tried, and distance of a point on one over the camera's height above it.
-_PLANES = 1000
-_ON_PLANE = 0.03
 #: Standard deviation (degrees) of a plane through three points.
 _LEVEL_STD_DEG = 3.0
 #: Least standard deviation of the scale by a body's distance from the camera: the lifter's sizes.
@@ -39,10 +37,9 @@ _LEANS_DEG = 15.0
 #: Standard deviation (m) of a resting foot's height, and independent ones per second: a foot rests for half a second.
 _FOOT_STD_M = 0.05
 FEET_HZ = 2.0
-#: The same of a point of the ground, distance (m) from the feet up to which points count, and least number of them.
+#: The same of a point of the ground, and distance (m) from the feet up to which points count.
 _GROUND_STD_M = 0.1
 _GROUND_M = 15.0
-_LEAST_GROUND = 20
 #: Share of the points within the distance that lie on the ground's plane, at least.
 _GROUND_SHARE = 0.15
 #: Times (s) between two places of a foot that rests, and error (m) of its place.
@@ -187,25 +184,12 @@ def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np
     """
     near = np.abs(points[:, 3]) > 1e-9
     places = points[near, :3] / points[near, 3:]
-    if len(places) < _LEAST_GROUND:
-        return None
-    rng = np.random.default_rng(0)
-    corners = places[rng.integers(len(places), size=(_PLANES, 3))]
-    normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    normal *= np.sign(normal @ up)[:, None]
-    level = np.einsum("ni,ni->n", normal, corners[:, 0])
-    height = np.median(position @ normal.T, axis=0) - level
-    usual = normal @ up > np.cos(np.deg2rad(3.0 * _BODY_STD_DEG))
-    normal, level, height = (values[usual & (height > 0.0)] for values in (normal, level, height))
-    if not len(normal):
-        return None
-    on = (np.abs(places @ normal.T - level) < _ON_PLANE * height).sum(axis=0)
-    best = int(on.argmax())
-    if on[best] < max(_LEAST_GROUND, _GROUND_SHARE * len(places)):
+    plane = largest_plane(places, position, up, 3.0 * _BODY_STD_DEG)
+    if plane is None:
         return None
     # The lower foot of a frame stands, mostly; its ankle is a little above the ground.
-    down = -(feet @ normal[best])
-    above = position @ normal[best] - level[best]
+    down = -(feet @ plane.up)
+    above = position @ plane.up - plane.level
     standing = down.max(axis=1) + _ANKLE_M
     fits = (standing > 0.0) & (above > 0.0)
     if fits.mean() < 0.5:
@@ -213,7 +197,7 @@ def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np
     log = np.log(standing[fits] / above[fits])
     spread = 1.48 * float(np.median(np.abs(log - np.median(log))))
     scale = PathScale(float(np.exp(np.median(log))), max(_GROUND_SCALE_STD, 0.5 * spread))
-    return Level(normal[best], float(level[best]), scale, spread)
+    return Level(plane.up, plane.level, scale, spread)
 
 
 def body_up(joints: np.ndarray) -> tuple[np.ndarray, float]:
@@ -253,13 +237,13 @@ def _by_points(plane: _Plane, feet: np.ndarray, points: np.ndarray) -> _Plane | 
     near = np.abs(points[:, 3]) > 1e-9
     places = points[near, :3] / points[near, 3:]
     places = places[np.linalg.norm(places - middle, axis=1) < _GROUND_M]
-    if len(places) < _LEAST_GROUND:
+    if len(places) < LEAST_ON_PLANE:
         return None
     floor = plane._replace(height=plane.height - _ANKLE_M)
     found = _fit(floor, places, np.ones(len(places)), _GROUND_STD_M, hold_height=True)
     off = np.abs(places @ found.up - found.height)
     on = int((off < 2 * _GROUND_STD_M).sum())
-    if on < max(_LEAST_GROUND, _GROUND_SHARE * len(places)):
+    if on < max(LEAST_ON_PLANE, _GROUND_SHARE * len(places)):
         return None
     return found._replace(height=found.height + _ANKLE_M)
 
