@@ -7,7 +7,6 @@ shows now.  Orbits of 6 m at 19 deg/s, faults 14 s after the start of the flight
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -18,8 +17,8 @@ from figures import table, write_figures
 from flight_field_defects import DEFECTS
 
 from drocap_ros.flight.orbit.states import Command, State
-from drocap_ros.simulation.vehicle.loopback import is_setpoint
 from lab.flights.branches import over_processes
+from lab.flights.fault_injections import assign, begins, drop_setpoints, freeze, gust, perceived, pilot
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 
 FAULT_S, WATCH_S = 14.0, 7.0
@@ -49,60 +48,15 @@ class FaultRow(NamedTuple):
     timeout_s: float = 0.5
 
 
-def put(part: str = "", **values: Any) -> Inject:
-    """Set attributes of the loop, or of its part."""
-
-    def inject(loop: OrbitLoop) -> None:
-        for name, value in values.items():
-            setattr(getattr(loop, part) if part else loop, name, value)
-
-    return inject
-
-
-def _perceive(change: Callable[[Any], Any]) -> Inject:
-    return put(perceive=change)
-
-
-def _freeze(loop: OrbitLoop) -> None:
-    kept: list[Any] = []
-
-    def change(seen: Any) -> Any:
-        kept.append(seen)
-        return dataclasses.replace(kept[0], stamp_ns=seen.stamp_ns)
-
-    loop.perceive = change
-
-
-def _nobody(loop: OrbitLoop) -> None:
-    loop.perceive = lambda seen: dataclasses.replace(seen, track_id=0)
-
-
 def _jump(loop: OrbitLoop) -> None:
     loop.future_joints()[:, :, 0] += 3.0
-
-
-def _both(loop: OrbitLoop) -> None:
-    loop.down.cut = loop.up.cut = True
-
-
-def _gust(loop: OrbitLoop) -> None:
-    loop.copter.body.wind = np.array([0.0, 12.0, 0.0])
-
-
-def _gps(loop: OrbitLoop) -> None:
-    loop.copter.gps_lost_s = loop.t
-
-
-def _mode(name: str) -> Inject:
-    return lambda loop: loop.copter.set_mode(name, "pilot")
 
 
 def _stop(loop: OrbitLoop) -> None:
     loop.command(Command.STOP)
 
 
-_NOTHING = _perceive(lambda seen: None)
-_DROP = put("up", drops=is_setpoint)
+_NOTHING, _DEAD = assign(perceive=lambda seen: None), assign(stopped=True)
 ORBITS = (
     OrbitRow("ardupilot", "standing, calm, camera fixed", "0.19 (1.17); 0.9 (4.6); 72", mount="fixed"),
     OrbitRow("ardupilot", "standing, 8 m/s, level gimbal", "0.16 (0.55); 1.6 (5.8); 100", wind_m_s=8.0),
@@ -115,27 +69,27 @@ ORBITS = (
 FAULTS = (
     FaultRow("ardupilot", "operator stop", "0.0; 1.8 to 2.1", _stop),
     FaultRow("ardupilot", "perception stops", "0.27; 2.4", _NOTHING),
-    FaultRow("ardupilot", "frozen picture", "0.30; 1.9", _freeze),
-    FaultRow("ardupilot", "nobody", "0.29; 2.9", _nobody),
+    FaultRow("ardupilot", "frozen picture", "0.30; 1.9", freeze),
+    FaultRow("ardupilot", "nobody", "0.29; 2.9", perceived(lambda seen: {"track_id": 0})),
     FaultRow("ardupilot", "subject jumps 3 m", "0.33; 3.0", _jump),
-    FaultRow("ardupilot", "telemetry cut", "0.14; 2.1", put("down", cut=True)),
-    FaultRow("ardupilot", "uplink cut", "0.39; 2.2", put("up", cut=True)),
-    FaultRow("ardupilot", "both ways cut", "0.15; 2.7", _both),
-    FaultRow("ardupilot", "SIGKILL", "0; 1.8 to 5.7", put(stopped=True)),
-    FaultRow("ardupilot", "SIGKILL, GUID_TIMEOUT 0.3", "0; 1.7 to 3.4", put(stopped=True), timeout_s=0.3),
-    FaultRow("ardupilot", "SIGSTOP for 3 s", "0; 1.9", put(stopped=True), (3.0, put(stopped=False))),
-    FaultRow("ardupilot", "GPS lost", "0.40; 4.3", _gps),
-    FaultRow("ardupilot", "gust of 12 m/s", "0.74; 7.6", _gust),
-    FaultRow("ardupilot", "setpoints alone dropped", "never; 2.5", _DROP),
+    FaultRow("ardupilot", "telemetry cut", "0.14; 2.1", assign("down", cut=True)),
+    FaultRow("ardupilot", "uplink cut", "0.39; 2.2", assign("up", cut=True)),
+    FaultRow("ardupilot", "both ways cut", "0.15; 2.7", assign("link", cut=True)),
+    FaultRow("ardupilot", "SIGKILL", "0; 1.8 to 5.7", _DEAD),
+    FaultRow("ardupilot", "SIGKILL, GUID_TIMEOUT 0.3", "0; 1.7 to 3.4", _DEAD, timeout_s=0.3),
+    FaultRow("ardupilot", "SIGSTOP for 3 s", "0; 1.9", _DEAD, (3.0, assign(stopped=False))),
+    FaultRow("ardupilot", "GPS lost", "0.40; 4.3", begins("gps_lost_s")),
+    FaultRow("ardupilot", "gust of 12 m/s", "0.74; 7.6", gust),
+    FaultRow("ardupilot", "setpoints alone dropped", "never; 2.5", drop_setpoints),
     FaultRow("px4", "operator stop", "0.0; 1.0 to 1.3", _stop),
     FaultRow("px4", "perception stops", "0.34; 1.8", _NOTHING),
-    FaultRow("px4", "SIGKILL", "0; 2.8 to 3.0", put(stopped=True)),
-    FaultRow("px4", "uplink cut", "0.4; 2.6", put("up", cut=True)),
-    FaultRow("px4", "setpoints alone dropped", "0.9; 2.9 to 3.1", _DROP),
-    FaultRow("px4", "SIGSTOP for 3 s", "0; 3.4, 4.4", put(stopped=True), (3.0, put(stopped=False))),
-    FaultRow("px4", "pilot's LOITER", "0.9; 1.8", _mode("LOITER")),
-    FaultRow("px4", "pilot's RTL", "0.9; -", _mode("RTL")),
-    FaultRow("px4", "pilot's POSCTL", "0.9; 2.0", _mode("POSCTL")),
+    FaultRow("px4", "SIGKILL", "0; 2.8 to 3.0", _DEAD),
+    FaultRow("px4", "uplink cut", "0.4; 2.6", assign("up", cut=True)),
+    FaultRow("px4", "setpoints alone dropped", "0.9; 2.9 to 3.1", drop_setpoints),
+    FaultRow("px4", "SIGSTOP for 3 s", "0; 3.4, 4.4", _DEAD, (3.0, assign(stopped=False))),
+    FaultRow("px4", "pilot's LOITER", "0.9; 1.8", pilot("LOITER")),
+    FaultRow("px4", "pilot's RTL", "0.9; -", pilot("RTL")),
+    FaultRow("px4", "pilot's POSCTL", "0.9; 2.0", pilot("POSCTL")),
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from drocap_ros.cli.options import (
     Subparsers,
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     write = _list if args.list else _track if people is None else _track_people
     selection = Selection(clip_of(args), person, topic=args.topic, people=people or (), threads=args.threads)
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
-        text = write(args, config, folder, selection, target, progress)
+        text = write(_Job(args, config, folder, selection, target, progress))
     if not args.quiet:
         tracks = "tracks.npz" if people is None else "person_N/tracks.npz"
         names = "persons.jpg" if args.list else f"{tracks}, overlay.mp4" if args.overlay else tracks
@@ -90,15 +90,20 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _list(
-    args: argparse.Namespace,
-    config: DrocapConfig,
-    models: Path,
-    selection: Selection,
-    target: Path,
-    progress: Progress,
-) -> str:
+class _Job(NamedTuple):
+    """What is tracked: options, parameters, folder of networks, part of the input; where to; the bars."""
+
+    args: argparse.Namespace
+    config: DrocapConfig
+    models: Path
+    selection: Selection
+    target: Path
+    progress: Progress
+
+
+def _list(job: _Job) -> str:
     """Write the picture of the persons; returns a line for each."""
+    args, config, models, selection, target, progress = job
     import cv2
 
     from drocap_ros.open_images import open_images
@@ -117,15 +122,9 @@ def _list(
     return "\n".join([*lines, "`drocap reconstruct` and `drocap track` take the number: --subject N"])
 
 
-def _track(
-    args: argparse.Namespace,
-    config: DrocapConfig,
-    models: Path,
-    selection: Selection,
-    target: Path,
-    progress: Progress,
-) -> str:
+def _track(job: _Job) -> str:
     """Write the tracks of every subject, and the overlay; returns a line about them."""
+    args, config, models, selection, target, progress = job
     from drocap_ros.open_images import open_images
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.sources.base import in_order
@@ -158,15 +157,9 @@ def _track(
     return "\n".join([_summary(found, len(observations)), *changes[1:], *_overlay_words(drawn.codec)])
 
 
-def _track_people(
-    args: argparse.Namespace,
-    config: DrocapConfig,
-    models: Path,
-    selection: Selection,
-    target: Path,
-    progress: Progress,
-) -> str:
+def _track_people(job: _Job) -> str:
     """Write the tracks of everybody, or of the selected people, and the overlay; returns a line for each."""
+    args, config, models, selection, target, progress = job
     from drocap_ros.open_images import open_images
     from drocap_ros.people import track_people
     from drocap_ros.report.overlay import OverlayVideo

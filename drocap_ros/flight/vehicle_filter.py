@@ -64,7 +64,6 @@ class VehicleFilter:
     Attributes
     ----------
     position, velocity : (3,) m, m/s, ENU; NaN before the first report
-    velocity_sd : (3,) m/s, estimated error of the reported velocity
     """
 
     def __init__(self, velocity_sd_m_s: float) -> None:
@@ -83,12 +82,6 @@ class VehicleFilter:
     def velocity_offset(self) -> np.ndarray:
         """(3,) m/s, reported minus filtered velocity."""
         return self._error
-
-    @property
-    def velocity_sd(self) -> np.ndarray:
-        """(3,) m/s."""
-        deviation: np.ndarray = np.sqrt(self._variance)
-        return deviation
 
     def take(self, stamp_s: float, position: np.ndarray, velocity: np.ndarray) -> Doubt:
         """Take a report, (3,) m and (3,) m/s ENU, and say what it contradicts.
