@@ -147,9 +147,12 @@ def fly_fault(row: FaultRow, seed: int) -> str:
     return f"{last_s:.2f}; {moved:.2f}; top {top:.2f} m/s; {loop.copter.mode}; {state}"
 
 
-def cells(job: tuple[Any, int]) -> list[str]:
-    """A row of the page; the flights of all seeds."""
-    row, seeds = job
+ROWS: tuple[Any, ...] = (*ORBITS, *FAULTS, *DEFECTS)
+
+
+def cells(job: tuple[int, int]) -> list[str]:
+    """A row of the page by its number; the flights of all seeds."""
+    row, seeds = ROWS[job[0]], job[1]
     begin_s = time.process_time()
     if isinstance(row, OrbitRow):
         results = [fly_orbit(row, 2 + i) for i in range(seeds)]
@@ -169,10 +172,8 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=3, help="flights of each orbit and fault")
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
     args = parser.parse_args()
-    chosen = [
-        row for row in (*ORBITS, *FAULTS, *DEFECTS) if not args.words or any(word in row.name for word in args.words)
-    ]
-    found = list(over_processes(cells, [(row, args.seeds) for row in chosen], args.jobs))
+    chosen = [i for i, row in enumerate(ROWS) if not args.words or any(word in row.name for word in args.words)]
+    found = list(over_processes(cells, [(i, args.seeds) for i in chosen], args.jobs))
     text = (
         "Orbits: radius error in m, mean (worst); yaw error in deg; share of the time in the middle third in %. Faults:"
         " last moving setpoint in s after it; farthest in m within 5 s.  Real: measured with the real autopilots in"
