@@ -88,21 +88,3 @@ def error_mm(
         for sequence in sequences
     ]
     return 1000.0 * float(np.mean(errors))
-
-
-#: Errors of the simulated evidence: standard deviation per coordinate, across the image and in depth, mm, and the time
-#: over which it lasts, frames.  They give 92 mm after alignment and 87 % right signs (BlazePose: 85, 89).
-_EVIDENCE_MM = (35.0, 35.0, 110.0)
-_EVIDENCE_FRAMES = 6.0
-
-
-def simulated_evidence(sequence: Sequence, tracks: Tracks, seed: int = 0) -> Tracks:
-    """The tracks with a single-image method's poses: true ones in camera axes, mm, with errors that last."""
-    from scipy.ndimage import gaussian_filter1d
-
-    assert tracks.camera_rotation is not None
-    truth = (sequence.x - sequence.x[:, :1]) @ np.swapaxes(tracks.camera_rotation, 1, 2)
-    wander = gaussian_filter1d(np.random.default_rng(seed).normal(size=truth.shape), _EVIDENCE_FRAMES, axis=0)
-    error = wander / wander.std() * _EVIDENCE_MM
-    sigma = np.full(truth.shape[:2], _EVIDENCE_MM[2])
-    return replace(tracks, evidence=truth + error, evidence_sigma=sigma)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
@@ -17,7 +18,7 @@ from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.evidence import body_places, with_evidence
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import load_tracks, save_tracks
-from lab.studies.near_camera import NearCamera, known, simulated_evidence
+from lab.studies.near_camera import NearCamera, known
 
 NAMES = {
     "SMPL": "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot"
@@ -71,15 +72,25 @@ def sequence(shared: Path) -> Sequence:
     return protocol_sequences(shared / "mocap" / "dev")[0]
 
 
+def simulated_evidence(truth: np.ndarray) -> dict[str, np.ndarray]:
+    """A single-image method's poses: true ones (F, P, 3) mm in camera axes, with errors that last for six frames.
+
+    35 mm across the image and 110 in depth give 92 mm after alignment and 87 % right signs (BlazePose: 85, 89).
+    """
+    error_mm = np.array([35.0, 35.0, 110.0])
+    wander = gaussian_filter1d(np.random.default_rng(0).normal(size=truth.shape), 6.0, axis=0)
+    evidence = truth + wander / wander.std() * error_mm
+    return {"evidence": evidence, "evidence_sigma": np.full(truth.shape[:2], error_mm[2])}
+
+
 def test_a_mirrored_start_is_put_right_and_keypoints_keep_their_joints(sequence: Sequence) -> None:
     """A camera without perspective, held still: the mirror image of a limb explains the keypoints as well."""
     camera = NearCamera(100.0, focal=20.0)
     whole = camera.tracks(sequence)
     alone = known(whole, lens=False, rotation=False, position=False)
-    told = simulated_evidence(sequence, whole)
-    told = dataclasses.replace(alone, evidence=told.evidence, evidence_sigma=told.evidence_sigma)
     assert whole.camera_rotation is not None
     truth = (sequence.x - sequence.x[:, :1]) @ np.swapaxes(whole.camera_rotation, 1, 2)
+    told = dataclasses.replace(alone, **simulated_evidence(truth))
     without, with_it = (reconstruct(t) for t in (alone, told))
     errors = [float(pa_mpjpe(motion.joints3d, truth).mean()) for motion in (without, with_it)]
     assert errors[1] < errors[0]
