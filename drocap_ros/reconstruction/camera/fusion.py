@@ -14,7 +14,8 @@ import numpy as np
 from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.geometry.rotations import exp_so3, log_so3, project_to_so3
-from drocap_ros.reconstruction.camera.path_adjustment import ENOUGH_POINTS, AdjustedPath, adjust_path
+from drocap_ros.reconstruction.camera.causes import contradicted_share, single_causes
+from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
 from drocap_ros.reconstruction.camera.path_model import (
     ATTITUDE_LATENCY,
     KNOT,
@@ -52,9 +53,6 @@ _OTHER = 1.5
 _LEAST_COVERED = 0.5
 #: Median residual (px per 1000 px of focal length) above which no camera's path explains the points.
 _LARGEST_RESIDUAL = 3.0
-#: Weight of an observation that fits, and the share of a frame's points with it, below which most lie elsewhere.
-_FITS = 0.25
-_FEW = 0.25
 #: Latency (s) from which the reports are shifted, and the largest share of it that its standard deviation may be.
 _LONG_S = 0.02
 _SURE = 0.2
@@ -72,7 +70,7 @@ class FusedTelemetry:
     config : of the adjustment in the world: what is left of the telemetry's errors
     path : of the longest part, as adjusted
     measured : JSON-compatible, of the longest part: constant errors and their standard deviations, that of the path's
-        mean position (xx, xy, xz, yy, yz, zz m^2), and the points
+        mean position (xx, xy, xz, yy, yz, zz m^2), the points, and single causes of most of it
     """
 
     tracks: Tracks
@@ -89,8 +87,8 @@ def fuse_telemetry(
 
     A refusal where no camera's path near the telemetry explains the points.  ``known`` : as of ``PathInput``.
     """
-    rotation, position, points = tracks.camera_rotation, tracks.camera_position, tracks.background
-    if points is None or rotation is None or position is None or not refinable(tracks):
+    rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
+    if tracks.background is None or rotation is None or position is None or matrix is None or not refinable(tracks):
         return None
     slot, fps = even_slots(tracks.stamp_ns)
     origin = position.mean(axis=0)
@@ -113,7 +111,8 @@ def fuse_telemetry(
                 best = found, given
     assert best is not None  # a recording has a part, and it has a window
     change, covariance, steps = faded.mean()
-    measured = _measured(*best)
+    causes = single_causes(best[1], best[0], matrix, path_config(config))
+    measured = _measured(*best) | {"causes": causes}
     corrected = replace(
         tracks,
         camera_rotation=(exp_so3(change[:, 3:]) @ turn)[slot],
@@ -298,18 +297,11 @@ def _measured(found: AdjustedPath, given: CameraTelemetry) -> dict[str, Any]:
             "tracks": len(found.views.track),
             "residual_px": found.residual_px,
             "covered_share": found.covered,
-            "contradicted_share": _contradicted(found),
+            "contradicted_share": contradicted_share(found),
             "position_wander_m": wander[0],
             "attitude_wander_deg": wander[1],
         },
     }
-
-
-def _contradicted(found: AdjustedPath) -> float:
-    """Share of the frames whose points lie elsewhere than the corrected path sees most of them."""
-    frame, frames = found.views.frame, len(found.rotation)
-    seen, fit = np.bincount(frame, minlength=frames), np.bincount(frame, found.weight > _FITS, minlength=frames)
-    return float(((seen >= ENOUGH_POINTS) & (fit < _FEW * seen)).mean())
 
 
 def with_fusion(refined: RefinedWorld, fused: FusedTelemetry) -> RefinedWorld:

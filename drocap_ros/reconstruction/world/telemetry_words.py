@@ -47,12 +47,22 @@ def _camera(camera: Mapping[str, Any]) -> str:
 
 def _calibrations(windows: list[Mapping[str, Any]], height_m: float | None) -> str:
     """The worst of each fact over the windows of a long recording."""
-    corrections = ", ".join(_corrections(windows)) or "no error of the telemetry is clear"
+    corrections = _causes(windows) or ", ".join(_corrections(windows)) or "no error of the telemetry is clear"
     scale = f"scale known to {100 * max(w['scale_std'] for w in windows):.1f} %"
     feet = f"feet in contact for {100 * min(w['contact_share'] for w in windows):.0f} % of the time"
     worst = f" (worst of {len(windows)} windows)" if len(windows) > 1 else ""
     rest = f"{worst}{_points(windows)}{_path(windows)}{_stature(windows, height_m)}."
     return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}{rest}"
+
+
+def _causes(windows: list[Mapping[str, Any]]) -> str:
+    """The single error, or errors that are not told apart, by which points explain most of what they correct."""
+    causes = windows[0].get("causes") or []
+    named = [f"{c['cause']} corrected by {_size(c['size'], c['std'], c['unit'])}" for c in causes]
+    if not named:
+        return ""
+    share = f"explains {100 * causes[0]['explains']:.0f} % of what the points contradict"
+    return f"{named[0]} {share}" if len(named) == 1 else f"{' or '.join(named)} {share}; they are not told apart"
 
 
 def _corrections(windows: list[Mapping[str, Any]]) -> list[str]:
@@ -88,6 +98,8 @@ def _points(windows: list[Mapping[str, Any]]) -> str:
     ]
     if (share := seen.get("contradicted_share", 0.0)) > _CONTRADICTED:
         words += f"; for {100 * share:.0f} % of the time most lie elsewhere: they move, or the log is wrong there"
+    if windows[0].get("causes"):  # the wander is what other terms take of that error
+        return words
     return words + (f"; against them the reported pose wanders, {' and '.join(wander)}" if wander else "")
 
 
@@ -105,9 +117,12 @@ def _path(windows: list[Mapping[str, Any]]) -> str:
 
 def _correction(name: str, found: list[tuple[float, float]], unit: str) -> str:
     value, std = max(found, key=lambda v: abs(v[0]) / v[1])
+    return f"{name} corrected by {_size(value, std, unit)}" if abs(value) > _CLEAR * std else ""
+
+
+def _size(value: float, std: float, unit: str) -> str:
     digits = 0 if unit == "ms" else 1
-    clear = abs(value) > _CLEAR * std
-    return f"{name} corrected by {value:.{digits}f} +- {std:.{digits}f} {unit}" if clear else ""
+    return f"{value:.{digits}f} +- {std:.{digits}f} {unit}"
 
 
 def _stature(windows: list[Mapping[str, Any]], height_m: float | None) -> str:
