@@ -48,7 +48,7 @@ def test_track_writes_tracks_and_an_overlay(models, shared, tmp_path, capsys):
     assert np.ptp(way, axis=0).max() < 1.0
 
 
-def moving_camera(folder: Path, count: int = 12) -> None:
+def moving_camera(folder: Path, count: int = 16) -> None:
     """Images of a rendered man before a wall with a pattern, over which the camera pans by 6 px an image."""
     cv2 = pytest.importorskip("cv2")
     folder.mkdir()
@@ -70,10 +70,10 @@ def test_overlay_shows_the_points_of_the_scene_on_request(tmp_path, capsys):
         out = tmp_path / f"out{len(option)}"
         assert main([*words, *option, "--out", str(out)]) == 0
         video = cv2.VideoCapture(str(out / "overlay.mp4"))
-        video.set(cv2.CAP_PROP_POS_FRAMES, 11)
+        video.set(cv2.CAP_PROP_POS_FRAMES, 15)
         last[option] = video.read()[1].astype(int)
     points = load_tracks(tmp_path / "out1" / "tracks.npz").background
-    wall = points.point[(points.frame == 11) & (points.point[:, 1] < 70)]
+    wall = points.point[(points.frame == 15) & (points.point[:, 1] < 70)]
     assert len(wall) > 10
     x, y = np.round(wall).astype(int).T
     for option, shown in (("--points",), True), ((), False):
