@@ -59,7 +59,7 @@ class BundleAdjusterConfig(Parameters):
 
     lifter: str = param("", "the default method's lifter, an ONNX file; empty for the shipped one")
     limb_iterations_first: int = param(
-        3, "steps of the default method that find the bone lengths", minimum=0, maximum=1000
+        2, "steps of the default method that find the bone lengths", minimum=0, maximum=1000
     )
     limb_iterations: int = param(
         12,

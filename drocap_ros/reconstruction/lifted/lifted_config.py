@@ -32,7 +32,7 @@ class LiftedConfig:
     """
 
     lifter: str = ""
-    first_iterations: int = 3
+    first_iterations: int = 2
     iterations: int = 12
     noise_mm: float = 2.0
     depth_weight: float = 0.2
