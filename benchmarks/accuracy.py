@@ -11,6 +11,7 @@ telemetry    the motion in the world by telemetry that errs (`drocap evaluate wo
              accuracy_telemetry
 together     two cameras 120 degrees apart whose times and places nobody knows (`drocap reconstruct A B --together`),
              every third sequence: page accuracy_together
+planned      flights by a plan against steady orbits of equal length: page accuracy_planned
 calibration  gimbal yaw and latency found from telemetry that errs, an orbit that reverses once, `--runs` flights: page
              accuracy_calibration
 
@@ -52,6 +53,8 @@ from lab.studies.live_study import live_study
 from lab.studies.live_study_table import live_markdown
 from lab.studies.live_world import live_world_markdown, live_world_study
 from lab.studies.near_camera import DISTANCES_M, NearCamera, error_mm, known, without_camera
+from lab.studies.planned_flight import SECONDS as PLANNED_S
+from lab.studies.planned_flight import planned_markdown, planned_study
 from lab.studies.together import together_markdown, together_study
 
 SPEED_DEG_S = 25.0
@@ -210,9 +213,18 @@ def together(args: argparse.Namespace) -> None:
     write_figures("accuracy_together", "One body in the views of two cameras", "\n".join(pages))
 
 
+def planned(args: argparse.Namespace) -> None:
+    """Planned flights against steady orbits of equal length."""
+    with progress_bars() as progress:
+        rows = planned_study(args.mocap, args.limit, progress)
+    text = f"Flights of {PLANNED_S:g} s that begin at the same place, exact telemetry, one seed a sequence.\n\n"
+    write_figures("accuracy_planned", "Planned flights", text + planned_markdown(rows))
+
+
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective, "near": near,
     "world": world, "telemetry": telemetry, "together": together, "calibration": calibration,
+    "planned": planned,
 }  # fmt: skip
 
 

@@ -1,8 +1,9 @@
 """Node ``mavlink_bridge``: the autopilot's telemetry on topics and TF, and the orbit of the subject.
 
-Subscribes ``pose2d``, ``camera_info``, and ``orbit/status``, where a second bridge would appear; publishes
-``vehicle/state`` (drocap_ros/VehicleState), TF ``map`` -> ``base_link`` and ``map`` -> ``camera_optical``, and
-``orbit/status`` (drocap_ros/OrbitStatus); serves ``orbit/command`` (drocap_ros/OrbitCommand).
+Subscribes ``pose2d``, ``camera_info``, ``pose3d/views`` (the forecast of a planned flight), and ``orbit/status``,
+where a second bridge would appear; publishes ``vehicle/state`` (drocap_ros/VehicleState), TF ``map`` -> ``base_link``
+and ``map`` -> ``camera_optical``, and ``orbit/status`` (drocap_ros/OrbitStatus); serves ``orbit/command``
+(drocap_ros/OrbitCommand).
 
 With ``commands_enabled`` false (the default) it reads only: it sends heartbeats, time synchronization and requests
 for telemetry, and refuses every start of an orbit.
@@ -18,6 +19,7 @@ from functools import partial
 import numpy as np
 from geometry_msgs.msg import Point, TransformStamped
 from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import Float32MultiArray
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
@@ -41,6 +43,7 @@ from drocap_ros.ros.conversions import (
     stamp_from_ros,
     transform_to_ros,
     vehicle_state_to_ros,
+    views_from_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.rclpy_internals import AnswerKey, PolledService
@@ -88,6 +91,7 @@ class MavlinkBridgeNode(ComponentNode):
         self.input("camera_info", self._on_camera_info)
         self.input("pose2d", self._on_pose2d, with_info=True)
         self.input("orbit/status", self._on_status)
+        self.input("pose3d/views", self._on_views)
         self._rivals = Rivals(self.get_namespace())
         self.requests = PolledService(self, OrbitCommand, "orbit/command", RESULT_QOS)
         self._unanswered: list[tuple[OperatorCommand, OrbitCommand.Request, AnswerKey]] = []
@@ -178,6 +182,7 @@ class MavlinkBridgeNode(ComponentNode):
                 float(request.height_m),
                 float(request.angular_speed_deg_s),
                 stamp_from_ros(request.stamp),
+                str(request.plan),
             )
             self._unanswered.append((command, request, header))
             self.controller.command(command)
@@ -232,6 +237,9 @@ class MavlinkBridgeNode(ComponentNode):
 
     def _on_status(self, message: OrbitStatus) -> None:
         self._rivals.take_status(stamp_from_ros(message.header.stamp), self.now_s())
+
+    def _on_views(self, message: Float32MultiArray) -> None:
+        self.controller.on_views(views_from_ros(message), self.now_s())
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         matrix, size = np.array(message.k, dtype=float).reshape(3, 3), (message.width, message.height)

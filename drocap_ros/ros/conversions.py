@@ -11,9 +11,11 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage
-from std_msgs.msg import Header
+from std_msgs.msg import Float32MultiArray, Header
 
 from drocap_ros.background import FixedPoints
+from drocap_ros.errors import InputError
+from drocap_ros.flight.orbit.view_plan import ViewForecast
 from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
@@ -208,6 +210,35 @@ def window_to_ros(
     )
 
 
+def views_to_ros(views: ViewForecast) -> Float32MultiArray:
+    """Forecast of the views -> message: the person's turn, then bearing, elevation and error of each view."""
+    each = np.stack([views.bearing_deg, views.elevation_deg, views.error_m], axis=-1)
+    return Float32MultiArray(data=floats(np.concatenate([[views.turn_deg_s], each.ravel()])))
+
+
+def views_from_ros(message: Float32MultiArray) -> ViewForecast:
+    """Message -> forecast of the views.
+
+    Raises
+    ------
+    InputError
+        When the views are no whole grid, or a value is impossible.
+    """
+    data = np.array(message.data, dtype=float)
+    count = (len(data) - 1) // 3
+    if count < 1 or len(data) != 1 + 3 * count or not np.isfinite(data).all():
+        raise InputError(
+            f"data: expected a finite turn and three finite numbers for each view, got {len(data)} numbers"
+        )
+    bearing, elevation, error = data[1:].reshape(count, 3).T
+    grid = len(np.unique(bearing)) * len(np.unique(elevation))
+    if count != grid or (error <= 0.0).any():
+        raise InputError(
+            f"data: expected errors above 0 m of a grid of {grid} views, got {count}, the least {error.min():g}"
+        )
+    return ViewForecast(bearing, elevation, error, float(data[0]))
+
+
 def camera_transform(window: AdjustedWindow, child: str) -> TransformStamped:
     """``odom`` -> optical frame, of the newest image of a window there."""
     assert window.in_map is not None
@@ -230,15 +261,21 @@ def pose3d_from_ros(message: Pose3D) -> tuple[np.ndarray, np.ndarray]:
 
 
 def orbit_request(
-    node: Node, command: int, radius_m: float = math.nan, height_m: float = math.nan, speed_deg_s: float = math.nan
+    node: Node,
+    command: int,
+    radius_m: float = math.nan,
+    height_m: float = math.nan,
+    speed_deg_s: float = math.nan,
+    plan: str = "",
 ) -> OrbitCommand.Request:
-    """A command for ``mavlink_bridge``, stamped by the node's clock; NaN = the configured or present value."""
+    """A command for ``mavlink_bridge``, stamped by the node's clock; NaN, "" = the configured or present value."""
     return OrbitCommand.Request(
         stamp=node.get_clock().now().to_msg(),
         command=command,
         radius_m=radius_m,
         height_m=height_m,
         angular_speed_deg_s=speed_deg_s,
+        plan=plan,
     )
 
 

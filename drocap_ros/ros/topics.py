@@ -9,6 +9,7 @@ from typing import NamedTuple
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
+from std_msgs.msg import Float32MultiArray
 from visualization_msgs.msg import ImageMarker, MarkerArray
 
 from drocap_ros.msg import BackgroundTracks, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
@@ -61,6 +62,8 @@ TOPICS: dict[str, Topic] = {
     "background": Topic(BackgroundTracks, RESULT_QOS, one_clock=True),
     "pose3d/initial": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS, one_clock=True),
+    # deg/s, how the person turns, then deg, deg, m for each view: bearing and elevation of a camera, expected error.
+    "pose3d/views": Topic(Float32MultiArray, RESULT_QOS),
     "pose3d/latest": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "vehicle/state": Topic(VehicleState, RESULT_QOS, one_clock=True),
     "orbit/status": Topic(OrbitStatus, RESULT_QOS),
@@ -113,8 +116,8 @@ NODES: dict[str, NodeEntry] = {
     "capture_simulator": NodeEntry(("pose2d", "camera_info"), source=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(
-        ("pose3d/refined", "pose3d/latest", *_TF),
-        ("pose2d", "pose3d/initial", "background", "vehicle/state", "camera_info"),
+        ("pose3d/refined", "pose3d/views", "pose3d/latest", *_TF),
+        ("pose2d", "pose3d/initial", "background", "vehicle/state", "camera_info", "orbit/status"),
         live=True,
         niceness=15,
     ),
@@ -142,7 +145,7 @@ NODES: dict[str, NodeEntry] = {
         for place in PLACES
     },
     "mavlink_bridge": NodeEntry(
-        ("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status"), live=True
+        ("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status", "pose3d/views"), live=True
     ),
     "visualizer": NodeEntry(
         ("markers/keypoints", "markers/initial", "markers/latest", "markers/camera_path", *_TF),

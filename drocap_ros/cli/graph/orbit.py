@@ -73,8 +73,10 @@ def run(args: argparse.Namespace) -> int:
         client = graph.node.create_client(SERVICES["orbit/command"], "orbit/command", qos_profile=RESULT_QOS)
         if not graph.wait(client.service_is_ready, end_s - time.monotonic()):
             raise no_graph
-        values = (math.nan if value is None else value for value in (args.radius, args.height, args.speed))
-        answer = client.call_async(orbit_request(graph.node, int(Command[args.action.upper()]), *values))
+        wanted = (args.radius, args.height, args.speed)
+        radius, height, speed = (math.nan if value is None else value for value in wanted)
+        command = int(Command[args.action.upper()])
+        answer = client.call_async(orbit_request(graph.node, command, radius, height, speed, args.plan or ""))
         if not graph.wait(answer.done, end_s - time.monotonic()):
             raise InputError(
                 f"orbit: expected an answer to {args.action} within {args.timeout:g} s, found none; "

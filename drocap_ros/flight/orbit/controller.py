@@ -95,10 +95,10 @@ class OrbitController:
         with self._lock:
             self._orbit.wish = wish
 
-    def on_views(self, views: ViewForecast, now_s: float, age_s: float) -> None:
-        """Take a forecast of the views, ``age_s`` old, for a plan."""
+    def on_views(self, views: ViewForecast, now_s: float) -> None:
+        """Take a forecast of the views for a plan."""
         with self._lock:
-            self._orbit.plan_by(views, now_s, age_s)
+            self._orbit.plan_by(views, now_s)
 
     # -- one step --------------------------------------------------------------------------------------
     def step(self, now_ns: int, now_s: float) -> ControlStatus:

@@ -31,8 +31,8 @@ from drocap_ros.flight.safety_config import HEIGHT_ROOM_M
 from drocap_ros.flight.subject.framing import Framing
 
 _SURE_SIZES = 3.0  # of size_error, beyond which the picture contradicts the height
-NO_POSES = "no forecast of the views (pose3d/refined, in map) has come"
-NO_NEWER = "no newer forecast of the views (pose3d/refined, in map) comes"
+NO_POSES = "no forecast of the views (pose3d/views: poses in map) has come"
+NO_NEWER = "no newer forecast of the views (pose3d/views: poses in map) comes"
 _FLOWN = (ConditionCode.ORBITING, ConditionCode.WIDENED, ConditionCode.SLOWED)
 
 
@@ -76,8 +76,7 @@ class FlownOrbit:
         if isinstance(wish, str) or wish.until_s < now_s:
             self._unplanned = wish if isinstance(wish, str) else NO_NEWER
             return
-        phase, flown_s = (0.0, 0.0) if self._reference is None else (self._reference.phase, self._reference.flown_s)
-        wished = planned_goal(self.goal, wish, phase, flown_s)
+        wished = planned_goal(self.goal, wish, self._reference) if self._reference else self.goal
         adjust = OperatorCommand(int(Command.ADJUST), *wished[:2], math.degrees(wished.angular_speed_rad_s))
         judged = commanded_goal(self._config, adjust, self.goal, framing)
         if isinstance(judged, Condition):
@@ -85,15 +84,15 @@ class FlownOrbit:
         else:
             self._flown = judged
 
-    def plan_by(self, views: ViewForecast, now_s: float, age_s: float) -> None:
-        """Wish by a forecast that is ``age_s`` old; without an orbit there is nothing to plan."""
+    def plan_by(self, views: ViewForecast, now_s: float) -> None:
+        """Wish by a forecast; without an orbit there is nothing to plan."""
         if self._reference is None or self.plan != ACCURACY:
             return
         config, reference = self._config, self._reference
         reach = reach_of(config, self.goal, reference.radius.value, self._greatest_m_s)
         place = (reference.phase, reference.height.value - config.ground_height_m)
         former = self.wish if isinstance(self.wish, Wish) and self.wish.until_s > now_s else None
-        self.wish = choose_view(views, place, reach, former, now_s - age_s)
+        self.wish = choose_view(views, place, reach, former, now_s)
 
     def begin(self, seen: Observed) -> None:
         """Begin an orbit where the vehicle is."""

@@ -26,7 +26,8 @@ _APART_DEG = 15.0  # between places that are compared
 _TURN_LASTS_S = 2.0  # of a person: then he faces elsewhere, and goes on
 _GAIN = 0.1  # share of the deviation by which another place must be better
 _MIDDLE_M = 0.95  # height of a person's joints above his ground
-_STOP_RATE = 0.5  # 1/s, angular speed over the way that is left: half of what the ramp of three seconds could stop
+_SWEEP_DEG = 30.0  # to both sides of the wished bearing, and the way of a turn: a still camera does not show sizes
+_SWUNG_DEG = 50.0  # what is flown of it
 
 
 class ViewForecast(NamedTuple):
@@ -102,27 +103,30 @@ def choose_view(
 
 
 def way_costs(views: ViewForecast, targets: np.ndarray, place: tuple[float, float], reach: Reach) -> np.ndarray:
-    """(N,) mean logarithms of the error over the horizon, on the shorter ways to targets (N, 2) deg, m, and there."""
+    """(N,) mean logarithms of the error over the horizon, on the shorter ways to targets (N, 2) deg, m, then there."""
     time = np.arange(0.0, _HORIZON_S, _STEP_S)
     left = np.mod(targets[:, :1] - math.degrees(place[0]) + 180.0, 360.0) - 180.0
     up = targets[:, 1:] - place[1]
     bearing = math.degrees(place[0]) + np.sign(left) * np.minimum(reach.fastest_deg_s * time, np.abs(left))
+    beyond = np.maximum(reach.fastest_deg_s * time - np.abs(left), 0.0)
+    bearing += 2.0 / np.pi * _SWUNG_DEG * np.arcsin(np.sin(0.5 * np.pi * beyond / _SWUNG_DEG))
     height = place[1] + np.sign(up) * np.minimum(reach.climb_m_s * time, np.abs(up))
     turned = views.turn_deg_s * np.minimum(time, _TURN_LASTS_S) if math.isfinite(views.turn_deg_s) else 0.0
     costs: np.ndarray = np.log(views.expected_m(bearing - turned, height, reach.radius_m)).mean(axis=1)
     return costs
 
 
-def planned_goal(goal: OrbitGoal, wish: Wish, phase: float, flown_s: float) -> OrbitGoal:
-    """What is flown for a wish: early one way and the other, then to its bearing, at most as fast as the goal.
+def planned_goal(goal: OrbitGoal, wish: Wish, orbit: OrbitState) -> OrbitGoal:
+    """What is flown for a wish: early one way and the other, then to its bearing and to and fro about it.
 
-    phase : rad, bearing of the reference;  flown_s : since the orbit began
+    The angular speed is that of the goal, forwards or backwards.
     """
     fastest = goal.angular_speed_rad_s
-    if flown_s < 2 * EARLY_S:
-        return goal._replace(angular_speed_rad_s=fastest if flown_s < EARLY_S else -fastest)
-    speed = _STOP_RATE * math.remainder(wish.bearing_rad - phase, 2 * math.pi)
-    return goal._replace(angular_speed_rad_s=min(max(speed, -abs(fastest)), abs(fastest)), height_m=wish.height_m)
+    if orbit.flown_s < 2 * EARLY_S:
+        return goal._replace(angular_speed_rad_s=fastest if orbit.flown_s < EARLY_S else -fastest)
+    left = math.remainder(wish.bearing_rad - orbit.phase, 2 * math.pi)
+    sense = left if abs(left) > math.radians(_SWEEP_DEG) else orbit.omega.value
+    return OrbitGoal(goal.radius_m, wish.height_m, math.copysign(fastest, sense))
 
 
 def fly_plan(
@@ -144,7 +148,7 @@ def fly_plan(
     velocity = np.gradient(subject, step_s, axis=0)
     for frame, (place, moving) in enumerate(zip(subject, velocity, strict=True)):
         wished = wish(frame, state)
-        flown = goal if wished is None else planned_goal(goal, wished, state.phase, state.flown_s)
+        flown = goal if wished is None else planned_goal(goal, wished, state)
         scene = Scene(reference_position(state), place, moving, greatest_speed_m_s=greatest_speed_m_s)
         state = advance(state, flown, scene, step_s, config)
         places.append(reference_position(state))

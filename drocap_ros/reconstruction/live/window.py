@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.background import Background
-from drocap_ros.flight.orbit.view_plan import ViewForecast
 from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
@@ -136,7 +135,6 @@ class AdjustedWindow:
     telemetry : use of the reported camera; reason : in words, why it was refused
     calibration : in words, the constant errors of the reports by fixed points; "" = they were not used
     picture : in words, the path by the picture alone, or why there is none; lost : whether it has just ended
-    views : forecast for a planned flight; None = there is none
     """
 
     stamp_ns: np.ndarray
@@ -155,4 +153,3 @@ class AdjustedWindow:
     picture: str = ""
     lost: bool = False
     in_map: InMap | None = None
-    views: ViewForecast | None = None
