@@ -12,6 +12,7 @@ telemetry    the motion in the world by telemetry that errs (`drocap evaluate wo
 together     two cameras 120 degrees apart whose times and places nobody knows (`drocap reconstruct A B --together`),
              every third sequence: page accuracy_together
 planned      flights by a plan against steady orbits of equal length: page accuracy_planned
+real         phone videos with optical MoCap (``--models DIR`` of the 2D networks): page accuracy_real
 calibration  gimbal yaw and latency found from telemetry that errs, an orbit that reverses once, `--runs` flights: page
              accuracy_calibration
 
@@ -29,6 +30,7 @@ import numpy as np
 from figures import ROOT, table, write_figures
 
 from drocap_ros.cli.progress import progress_bars
+from drocap_ros.config import DrocapConfig
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
 from drocap_ros.evaluation.protocol import (
     FPS,
@@ -55,6 +57,7 @@ from lab.studies.live_world import live_world_markdown, live_world_study
 from lab.studies.near_camera import DISTANCES_M, NearCamera, error_mm, known, without_camera
 from lab.studies.planned_flight import SECONDS as PLANNED_S
 from lab.studies.planned_flight import planned_markdown, planned_study
+from lab.studies.real_people import SYSTEMS, real_people_study
 from lab.studies.together import together_markdown, together_study
 
 SPEED_DEG_S = 25.0
@@ -221,9 +224,29 @@ def planned(args: argparse.Namespace) -> None:
     write_figures("accuracy_planned", "Planned flights", text + planned_markdown(rows))
 
 
+def real(args: argparse.Namespace) -> None:
+    """Phone videos with optical MoCap: by keypoints alone, and with feet and depth by a second network."""
+    models = args.models or ROOT.parent / "shared" / "models"
+    feet = sorted(path.stem for path in models.glob("blazepose-*.onnx"))
+    rows: dict[str, list[str]] = {}
+    for second in ["", *feet[:1]]:
+        config = DrocapConfig().replace("pose_estimator", feet_model=second)
+        found = real_people_study(args.mocap.parents[1] / "real", models, config)
+        for system in ("drocap", *SYSTEMS):
+            of = [row for row in found if row.system == system]
+            name = f"{system}, {second}" if second and system == "drocap" else system
+            mean = np.mean([row[2:] for row in of], axis=0)
+            cells = [(row.pa_mm, row.knees_deg, row.knees_signed_deg) for row in of] + [tuple(mean)]
+            rows[name] = [name, *(f"{pa:.1f}, {knees:.1f} ({signed:+.1f})" for pa, knees, signed in cells)]
+    head = ["system", *sorted({row.video for row in found}), "mean"]
+    text = "PA over twelve joints, mm, and both knees' mean absolute (mean) error, degrees. No lens is given.\n\n"
+    write_figures("accuracy_real", "Real people with optical MoCap", text + table(head, list(rows.values())))
+
+
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective, "near": near,
     "world": world, "telemetry": telemetry, "together": together, "calibration": calibration,
+    "real": real,
     "planned": planned,
 }  # fmt: skip
 
@@ -232,6 +255,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
     parser.add_argument("--mocap", type=Path, default=ROOT.parent / "shared" / "mocap" / "dev")
+    parser.add_argument("--models", type=Path, help="2D networks for real videos (default those beside the checkout)")
     parser.add_argument("--limit", type=int, help="only the first N sequences")
     parser.add_argument("--runs", type=int, default=20, help="flights of the calibration study (default 20)")
     words = "fixed points of the scene in the calibration study (default both)"
