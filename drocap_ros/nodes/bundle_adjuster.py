@@ -257,7 +257,7 @@ class BundleAdjusterNode(ComponentNode):
         if self._planned and window.telemetry is TelemetryUse.USED:
             views = self._views.forecast(window.stamp_ns, window.joints3d)
             if views is not None:
-                self._forecasts.publish(views_to_ros(views))
+                self._forecasts.publish(views_to_ros(views, int(window.stamp_ns[-1])))
         if window.in_map is not None and window.in_map.path and self._tf is not None:
             self._tf.publish(TFMessage(transforms=[camera_transform(window, solved.header.frame_id)]))
         self._sequence += 1

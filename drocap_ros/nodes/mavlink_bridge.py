@@ -19,7 +19,6 @@ from functools import partial
 import numpy as np
 from geometry_msgs.msg import Point, TransformStamped
 from sensor_msgs.msg import CameraInfo
-from std_msgs.msg import Float32MultiArray
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
@@ -33,7 +32,7 @@ from drocap_ros.flight.orbit.states import Command, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.rivals import Rivals
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.msg import OrbitStatus, Pose2D
+from drocap_ros.msg import OrbitStatus, Pose2D, ViewForecast
 from drocap_ros.parameters import Values
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode, MessageInfo
 from drocap_ros.ros.conversions import (
@@ -238,7 +237,7 @@ class MavlinkBridgeNode(ComponentNode):
     def _on_status(self, message: OrbitStatus) -> None:
         self._rivals.take_status(stamp_from_ros(message.header.stamp), self.now_s())
 
-    def _on_views(self, message: Float32MultiArray) -> None:
+    def _on_views(self, message: ViewForecast) -> None:
         self.controller.on_views(views_from_ros(message), self.now_s())
 
     def _on_camera_info(self, message: CameraInfo) -> None:

@@ -280,7 +280,7 @@ class Bodies:
         for one in self.people:
             if one.seen is not None and one.shown(stamp_ns):
                 apart = np.linalg.norm(one.seen.keypoints[: len(pose.xy)] - pose.xy, axis=1)[seen]
-                if np.median(np.nan_to_num(apart, nan=np.inf)) < 0.1 * one.track.length:
+                if np.median(np.nan_to_num(apart, nan=np.inf)) < _SAME_BODY * one.track.length:
                     return True
         return False
 

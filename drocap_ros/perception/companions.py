@@ -70,11 +70,11 @@ class Companions:
         Parameters
         ----------
         image : (H, W, 3) uint8 BGR
-        subject : of the same image; its stamp is the image's, one earlier than the last image's starts anew
+        subject : of the same image and stamp; an earlier stamp than the last one's begins a new stream
         """
         stamp_ns = subject.stamp_ns
         if stamp_ns < self._last_ns:
-            log.warning("stamps went back by %.3f s: persons are sought anew", (self._last_ns - stamp_ns) * 1e-9)
+            log.warning("stamps went back by %.3f s: other persons are forgotten", (self._last_ns - stamp_ns) * 1e-9)
             self._restart()
         self._last_ns = stamp_ns
         scene = self._scene.step(image, stamp_ns, self._boxes[0])

@@ -14,7 +14,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
-from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry
+from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, with_causes
 from drocap_ros.reconstruction.camera.kinds import Kind
 from drocap_ros.reconstruction.camera.picture_world import (
     PictureWorld,
@@ -158,7 +158,10 @@ def _reconstructed(
     every_joint = body_keypoints(tracks, BODY_19)
     keypoints = every_joint.with_joints(len(settings.body))
     with blas_threads(settings.adjuster.threads):
-        fused = fuse_telemetry(tracks, world_config(settings.adjuster)) if camera is None else camera
+        config = world_config(settings.adjuster)
+        fused = fuse_telemetry(tracks, config) if camera is None else camera
+        if camera is None and isinstance(fused, FusedTelemetry):
+            fused = with_causes(fused, config)
         corrected = time.perf_counter()
         if isinstance(fused, Refusal):
             found: _Solved | Refusal = fused

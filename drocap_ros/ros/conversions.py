@@ -11,14 +11,14 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage
-from std_msgs.msg import Float32MultiArray, Header
+from std_msgs.msg import Header
 
 from drocap_ros.background import FixedPoints
 from drocap_ros.errors import InputError
-from drocap_ros.flight.orbit.view_plan import ViewForecast
+from drocap_ros.flight.orbit.view_plan import ViewForecast as ViewForecastData
 from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
 from drocap_ros.geometry.rotations import quaternion_from_matrix
-from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
+from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState, ViewForecast
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.reconstruction.live.latest_place import PlacedPose
@@ -210,13 +210,18 @@ def window_to_ros(
     )
 
 
-def views_to_ros(views: ViewForecast) -> Float32MultiArray:
-    """Forecast of the views -> message: the person's turn, then bearing, elevation and error of each view."""
-    each = np.stack([views.bearing_deg, views.elevation_deg, views.error_m], axis=-1)
-    return Float32MultiArray(data=floats(np.concatenate([[views.turn_deg_s], each.ravel()])))
+def views_to_ros(views: ViewForecastData, stamp_ns: int) -> ViewForecast:
+    """Forecast of the views by poses in ``map`` until this time -> message."""
+    return ViewForecast(
+        header=Header(stamp=stamp_to_ros(stamp_ns), frame_id=MAP),
+        turn_deg_s=views.turn_deg_s,
+        bearing_deg=floats(views.bearing_deg),
+        elevation_deg=floats(views.elevation_deg),
+        error_m=floats(views.error_m),
+    )
 
 
-def views_from_ros(message: Float32MultiArray) -> ViewForecast:
+def views_from_ros(message: ViewForecast) -> ViewForecastData:
     """Message -> forecast of the views.
 
     Raises
@@ -224,19 +229,18 @@ def views_from_ros(message: Float32MultiArray) -> ViewForecast:
     InputError
         When the views are no whole grid, or a value is impossible.
     """
-    data = np.array(message.data, dtype=float)
-    count = (len(data) - 1) // 3
-    if count < 1 or len(data) != 1 + 3 * count or not np.isfinite(data).all():
-        raise InputError(
-            f"data: expected a finite turn and three finite numbers for each view, got {len(data)} numbers"
-        )
-    bearing, elevation, error = data[1:].reshape(count, 3).T
+    count = len(message.error_m)
+    bearing, elevation, error = (
+        float_array(getattr(message, name), (count,), name).astype(float)
+        for name in ("bearing_deg", "elevation_deg", "error_m")
+    )
     grid = len(np.unique(bearing)) * len(np.unique(elevation))
-    if count != grid or (error <= 0.0).any():
+    finite = np.isfinite([message.turn_deg_s, *bearing, *elevation, *error]).all()
+    if not (0 < count == grid and finite and (error > 0.0).all()):
         raise InputError(
-            f"data: expected errors above 0 m of a grid of {grid} views, got {count}, the least {error.min():g}"
+            f"error_m: expected finite errors above 0 m of a whole grid of views, got {count} of {grid} views"
         )
-    return ViewForecast(bearing, elevation, error, float(data[0]))
+    return ViewForecastData(bearing, elevation, error, float(message.turn_deg_s))
 
 
 def camera_transform(window: AdjustedWindow, child: str) -> TransformStamped:

@@ -17,7 +17,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.diagnostics import Key
-from drocap_ros.ros.rclpy_internals import answer_impossible_transitions
+from drocap_ros.ros.rclpy_internals import answer_impossible_transitions, end_state_machine
 from drocap_ros.ros.topics import NODES
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -90,6 +90,11 @@ class ManagedComponent(ComponentNode, LifecycleNodeMixin):
     def close(self) -> None:
         """Release the resource."""
         self.release()
+
+    def destroy_node(self) -> None:
+        """Destroy the node with all that it has in DDS."""
+        super().destroy_node()
+        end_state_machine(self)
 
     # -- transitions -----------------------------------------------------------------------------------
 

@@ -83,6 +83,11 @@ def answer_impossible_transitions(node: LifecycleNodeMixin, report: Callable[[st
     service.callback = guarded
 
 
+def end_state_machine(node: LifecycleNodeMixin) -> None:
+    """Let the state machine of a destroyed node go: its publisher would keep the DDS participant and its threads."""
+    node._state_machine = None
+
+
 class PolledService:
     """Server of one service; requests wait until the thread that decides takes them all, and answers them later."""
 

@@ -9,10 +9,9 @@ from typing import NamedTuple
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
-from std_msgs.msg import Float32MultiArray
 from visualization_msgs.msg import ImageMarker, MarkerArray
 
-from drocap_ros.msg import BackgroundTracks, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
+from drocap_ros.msg import BackgroundTracks, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState, ViewForecast
 from drocap_ros.srv import OrbitCommand
 
 try:
@@ -62,8 +61,7 @@ TOPICS: dict[str, Topic] = {
     "background": Topic(BackgroundTracks, RESULT_QOS, one_clock=True),
     "pose3d/initial": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS, one_clock=True),
-    # deg/s, how the person turns, then deg, deg, m for each view: bearing and elevation of a camera, expected error.
-    "pose3d/views": Topic(Float32MultiArray, RESULT_QOS),
+    "pose3d/views": Topic(ViewForecast, RESULT_QOS, one_clock=True),
     "pose3d/latest": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "vehicle/state": Topic(VehicleState, RESULT_QOS, one_clock=True),
     "orbit/status": Topic(OrbitStatus, RESULT_QOS),

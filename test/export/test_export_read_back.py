@@ -177,11 +177,11 @@ def test_export_is_deterministic(walker, tmp_path, form):
     assert (tmp_path / "a" / f"motion.{form}").read_bytes() == (tmp_path / "b" / f"motion.{form}").read_bytes()
 
 
-def test_five_minutes_are_exported_within_seconds(walker, tmp_path):
-    """7,200 frames: the bound excludes loops over frames."""
+def test_ten_minutes_are_exported_within_seconds(walker, tmp_path):
+    """14,400 frames: the bound excludes loops over frames."""
     import time
 
-    repeats = 150
+    repeats = 300
     many = {
         name: np.concatenate([getattr(walker, name)] * repeats)
         for name in ("joints3d", "camera_rotation", "confidence", "keypoints", "reprojection_px")
@@ -191,4 +191,4 @@ def test_five_minutes_are_exported_within_seconds(walker, tmp_path):
     begin = time.process_time()
     for form in ("bvh", "glb", "trc"):
         export(long, tmp_path / f"motion.{form}", form)
-    assert time.process_time() - begin < 10
+    assert time.process_time() - begin < 20

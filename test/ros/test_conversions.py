@@ -159,11 +159,15 @@ def test_stamps_keep_every_nanosecond():
 def test_a_forecast_of_the_views_is_sent_and_a_malformed_one_refused():
     bearing, elevation = (grid.ravel() for grid in np.meshgrid(np.arange(10.0, 370.0, 45.0), [10.0, 35.0]))
     views = ViewForecast(bearing, elevation, np.linspace(0.02, 0.05, 16), -7.0)
-    message = c.views_to_ros(views)
+    message = c.views_to_ros(views, 7)
+    assert c.stamp_from_ros(message.header.stamp) == 7
     for sent, value in zip(views, c.views_from_ros(message), strict=True):
         np.testing.assert_allclose(value, sent, rtol=1e-6)
-    good = list(message.data)
-    for bad in ([], good[:1], good[:-1], [*good[:3], 0.0, *good[4:]], [float("nan"), *good[1:]], good[:-3]):
-        message.data = array("f", bad)
-        with pytest.raises(InputError, match="data: expected"):
+    good = list(message.error_m)
+    for bad in ([], good[:1], good[:-1], [*good[:3], 0.0, *good[4:]], [float("nan"), *good[1:]]):
+        message.error_m = array("f", bad)
+        with pytest.raises(InputError, match="expected"):
             c.views_from_ros(message)
+    message = c.views_to_ros(views._replace(turn_deg_s=float("inf")), 7)
+    with pytest.raises(InputError, match="error_m: expected finite"):
+        c.views_from_ros(message)

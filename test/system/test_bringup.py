@@ -2,6 +2,7 @@
 
 import os
 import re
+import stat
 import subprocess
 import sys
 import time
@@ -14,12 +15,12 @@ import pytest
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
-from drocap_ros.bringup import bringup, free_domain, node_class
+from drocap_ros.bringup import bringup, free_domain, lockstep, node_class
 from drocap_ros.config import DrocapConfig, section_types
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.ros.conversions import stamp_from_ros
-from drocap_ros.ros.topics import NODES, TOPICS
+from drocap_ros.ros.topics import NODES, TOPICS, component_of, section_of
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 from drocap_ros.srv import OrbitCommand
 
@@ -187,9 +188,24 @@ def test_table_of_the_nodes_names_existing_topics():
 
 
 def test_every_node_has_a_module_and_a_section_of_the_configuration():
-    assert set(NODES) == set(section_types())
+    assert {section_of(name) for name in NODES} == set(section_types())
     for name in NODES:
-        assert node_class(name).component == name
+        assert node_class(name).component == component_of(name)[0]
+
+
+def test_a_graph_that_ended_leaves_no_socket(tmp_path):
+    """Its DDS participants would answer to the next graph of that domain, and keep their threads."""
+
+    def sockets():
+        return sum(stat.S_ISSOCK(os.stat(file).st_mode) for file in Path("/proc/self/fd").iterdir() if file.exists())
+
+    config = DrocapConfig().replace("session_recorder", session_dir=str(tmp_path / "session"), if_taken="next")
+    after = []
+    for _ in range(3):  # the first one leaves what the process has once
+        with lockstep(config, ["session_recorder"]):
+            pass
+        after.append(sockets())
+    assert len(set(after)) == 1, after
 
 
 def test_readme_s_example_runs_as_printed(root, tmp_path):

@@ -148,7 +148,7 @@ def test_a_planned_orbit_needs_a_forecast_and_flies_by_it():
         forecasts = graph.node.create_publisher(topic.message, "pose3d/views", topic.qos)
         bearing, elevation = (grid.ravel() for grid in np.meshgrid(np.arange(0.0, 360.0, 45.0), [10.0, 35.0]))
         views = ViewForecast(bearing, elevation, 0.03 + 0.02 * np.cos(np.radians(bearing)), 0.0)
-        graph.node.create_timer(0.5, lambda: forecasts.publish(views_to_ros(views)))
+        graph.node.create_timer(0.5, lambda: forecasts.publish(views_to_ros(views, time.time_ns())))
         graph.wait_until(lambda: got[-1].condition == OrbitStatus.CONDITION_PLANNED, 20, "the planned orbit")
         assert "by the plan at +15 deg/s and 2.5 m high: joints within" in got[-1].reason
         assert operator(graph, "adjust", "--plan", "steady") == (0, "orbit adjusted")

@@ -20,7 +20,7 @@ from drocap_ros.simulation.flight_simulator.truth import load_flight_truth, orbi
 
 def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_path, capsys):
     out = tmp_path / "demo"
-    assert main(["demo", "--seconds", "6", "--seed", "1", "--out", str(out), "--quiet"]) == 0
+    assert main(["demo", "--seconds", "8", "--seed", "1", "--out", str(out), "--quiet"]) == 0
     printed = capsys.readouterr().out
     # A person who holds every joint right but the depth of one arm is 60 mm off; depth = 0 would give 125.
     assert float(re.search(r"truth: ([\d.]+) mm", printed)[1]) < 90
@@ -57,10 +57,10 @@ def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_p
     orbiting = np.array([state == State.ORBITING for _, state in status])
     first, last = np.flatnonzero(orbiting)[[0, -1]]
     assert orbiting[first : last + 1].mean() > 0.5  # on a busy machine the bridge may hold for a while
-    assert status[last][0] - status[first][0] > 5e9
+    assert status[last][0] - status[first][0] > 7e9
     within = (truth.stamp_ns >= status[first][0]) & (truth.stamp_ns <= status[last][0])
     flown = orbit_quality(truth, within, 6.0)
-    assert flown.turned_deg > 45
+    assert flown.turned_deg > 60
     assert flown.least_distance_m > 3.0
     # In the world frame the person stands where the simulated one stood, to what an assumed stature allows; the
     # position that the vehicle tells has an error of its own.
@@ -75,7 +75,7 @@ def test_same_seed_gives_the_same_flight_beside_a_busy_process(tmp_path, capsys)
         out = tmp_path / name / "demo"
         with busy_processes(busy):
             assert (
-                main(["demo", "--seconds", "2", "--seed", "2", "--mount", "fixed", "--out", str(out), "--quiet"]) == 0
+                main(["demo", "--seconds", "3", "--seed", "2", "--mount", "fixed", "--out", str(out), "--quiet"]) == 0
             )
         printed.append(capsys.readouterr().out.replace(str(out), "OUT"))
         contents.append(session_contents(out / "session"))

@@ -25,7 +25,7 @@ from drocap_ros.flight.orbit.flown_orbit import FlownOrbit
 from drocap_ros.flight.orbit.observer import Observer, OwnFlight
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Limits, ModeRequest, OperatorCommand, SafetyState, State
-from drocap_ros.flight.orbit.view_plan import ViewForecast
+from drocap_ros.flight.orbit.view_plan import ViewForecast, choose_view
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.orbit.way_out import way_out
 from drocap_ros.flight.orbit_goal import Wish
@@ -96,9 +96,11 @@ class OrbitController:
             self._orbit.wish = wish
 
     def on_views(self, views: ViewForecast, now_s: float) -> None:
-        """Take a forecast of the views for a plan."""
+        """Take a forecast of the views for a plan; the loop does not wait for the choice."""
         with self._lock:
-            self._orbit.plan_by(views, now_s)
+            present = self._orbit.planned_from(now_s)
+        if present is not None:
+            self.on_wish(choose_view(views, *present, now_s))
 
     # -- one step --------------------------------------------------------------------------------------
     def step(self, now_ns: int, now_s: float) -> ControlStatus:

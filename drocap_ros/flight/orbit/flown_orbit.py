@@ -24,7 +24,7 @@ from drocap_ros.flight.orbit.planner import (
     setpoint_of,
 )
 from drocap_ros.flight.orbit.states import Command, Limits, OperatorCommand, SafetyState
-from drocap_ros.flight.orbit.view_plan import ViewForecast, choose_view, planned_goal, reach_of
+from drocap_ros.flight.orbit.view_plan import Reach, planned_goal, reach_of
 from drocap_ros.flight.orbit_config import ACCURACY
 from drocap_ros.flight.orbit_goal import OrbitGoal, Wish, goal_of
 from drocap_ros.flight.safety_config import HEIGHT_ROOM_M
@@ -84,15 +84,15 @@ class FlownOrbit:
         else:
             self._flown = judged
 
-    def plan_by(self, views: ViewForecast, now_s: float) -> None:
-        """Wish by a forecast; without an orbit there is nothing to plan."""
+    def planned_from(self, now_s: float) -> tuple[tuple[float, float], Reach, Wish | None] | None:
+        """What ``choose_view`` begins from: place, reach and present wish; None = there is nothing to plan."""
         if self._reference is None or self.plan != ACCURACY:
-            return
+            return None
         config, reference = self._config, self._reference
         reach = reach_of(config, self.goal, reference.radius.value, self._greatest_m_s)
         place = (reference.phase, reference.height.value - config.ground_height_m)
         former = self.wish if isinstance(self.wish, Wish) and self.wish.until_s > now_s else None
-        self.wish = choose_view(views, place, reach, former, now_s)
+        return place, reach, former
 
     def begin(self, seen: Observed) -> None:
         """Begin an orbit where the vehicle is."""

@@ -43,15 +43,17 @@ class ViewForecast(NamedTuple):
 
     def _log_error(self, bearing_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
         """Linear between the views of the grid."""
-        from scipy.ndimage import map_coordinates
-
         rows, columns = np.unique(self.elevation_deg), np.unique(self.bearing_deg)
         order = np.lexsort((self.bearing_deg, self.elevation_deg))
         table = np.log(self.error_m[order]).reshape(len(rows), len(columns))
         row = np.interp(elevation_deg, rows, np.arange(len(rows)))
         column = np.mod(bearing_deg - columns[0], 360.0) * len(columns) / 360.0
-        row, column = np.broadcast_arrays(row, column)
-        found: np.ndarray = map_coordinates(table, [row, column], order=1, mode="grid-wrap")
+        low, left = np.floor(row).astype(int), np.floor(column).astype(int) % len(columns)
+        high, right = np.minimum(low + 1, len(rows) - 1), (left + 1) % len(columns)
+        up, on = row - low, column % 1.0
+        below = (1.0 - on) * table[low, left] + on * table[low, right]
+        above = (1.0 - on) * table[high, left] + on * table[high, right]
+        found: np.ndarray = (1.0 - up) * below + up * above
         return found
 
     def expected_m(self, bearing_deg: np.ndarray, height_m: np.ndarray, radius_m: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Which single error of the telemetry explains what the points correct: yaw, pitch, roll, or stamps that are off.
 
-Every cause is fitted alone to the difference of the two paths, weighed by what the points tell of it: the parts that no
-point sees, as the place of the whole path, count for none.  Slow errors as configured explain the rest.
+Every cause is fitted alone to the difference of the two paths, weighed by the information of the points: the parts
+that no point sees, as the place of the whole path, count for none.  Slow errors as configured explain the rest.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _APART = 3.0
 #: Weight of an observation that fits, and the share of a frame's points with it, below which most lie elsewhere.
 _FITS = 0.25
 _FEW = 0.25
-#: The causes: what is off, and its unit per rad; or per s of a path
-#: that was reported so much too early, as stamps are corrected the other way.
+#: The causes: what is off, and its unit per rad; or per s of a path that was reported so much too early, as stamps are
+#: corrected the other way.
 _DEG, _MS = 180.0 / np.pi, -1000.0
 _CAUSES = (
     ("gimbal pitch", _DEG, "deg"),
@@ -46,9 +46,9 @@ _CAUSES = (
 def single_causes(
     given: CameraTelemetry, found: AdjustedPath, matrix: np.ndarray, config: PathConfig
 ) -> list[dict[str, Any]]:
-    """JSON-compatible causes that explain most of the difference, the best first; [] = no single one does, or none is.
+    """JSON-compatible causes that explain most of the difference, the best first; [] = no single one does.
 
-    Those behind the first are not told apart from it.  ``config`` : the expected errors
+    The points cannot distinguish the others from the first.  ``config`` : the expected errors
     """
     if not (np.abs(found.shared) > _CLEAR * found.shared_std).any():
         return []
@@ -64,7 +64,7 @@ def single_causes(
     none = np.zeros((knots.count, KNOT))
     state = PathState(none, np.zeros((given.frames, KNOT)), np.zeros(SHARED), points, unit)
     free = weights._replace(change=0 * weights.change, first=0 * weights.first, acceleration=0.0)
-    told, expected = (
+    by_points, expected = (
         PathEquations(PathResiduals(replace(data, views=views), w, state, OUTLIER_SQUARE)).band
         for w in (free, weights._replace(acceleration=0.0))
     )
@@ -72,7 +72,7 @@ def single_causes(
     if factor is None:
         return []
     columns = _columns(given, found, knots.frame)
-    seen = _product(told, columns)
+    seen = _product(by_points, columns)
     y = forward(factor, seen)
     gram = (columns.T @ seen - y.T @ y) / config.views_per_fact
     total = float(gram[0, 0])

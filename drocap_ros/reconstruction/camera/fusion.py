@@ -70,7 +70,8 @@ class FusedTelemetry:
     config : of the adjustment in the world: what is left of the telemetry's errors
     path : of the longest part, as adjusted
     measured : JSON-compatible, of the longest part: constant errors and their standard deviations, that of the path's
-        mean position (xx, xy, xz, yy, yz, zz m^2), the points, and single causes of most of it
+        mean position (xx, xy, xz, yy, yz, zz m^2), and the points
+    given : what the telemetry said of that part
     """
 
     tracks: Tracks
@@ -78,6 +79,7 @@ class FusedTelemetry:
     config: WorldConfig
     measured: dict[str, Any]
     path: AdjustedPath
+    given: CameraTelemetry
 
 
 def fuse_telemetry(
@@ -87,8 +89,8 @@ def fuse_telemetry(
 
     A refusal where no camera's path near the telemetry explains the points.  ``known`` : as of ``PathInput``.
     """
-    rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
-    if tracks.background is None or rotation is None or position is None or matrix is None or not refinable(tracks):
+    rotation, position, points = tracks.camera_rotation, tracks.camera_position, tracks.background
+    if points is None or rotation is None or position is None or not refinable(tracks):
         return None
     slot, fps = even_slots(tracks.stamp_ns)
     origin = position.mean(axis=0)
@@ -111,14 +113,19 @@ def fuse_telemetry(
                 best = found, given
     assert best is not None  # a recording has a part, and it has a window
     change, covariance, steps = faded.mean()
-    causes = single_causes(best[1], best[0], matrix, path_config(config))
-    measured = _measured(*best) | {"causes": causes}
     corrected = replace(
         tracks,
         camera_rotation=(exp_so3(change[:, 3:]) @ turn)[slot],
         camera_position=(path + change[:, :3])[slot] + origin,
     )
-    return FusedTelemetry(corrected, covariance[slot], _left(config, steps), measured, best[0])
+    return FusedTelemetry(corrected, covariance[slot], _left(config, steps), _measured(*best), *best)
+
+
+def with_causes(fused: FusedTelemetry, config: WorldConfig) -> FusedTelemetry:
+    """The same, its measures with the single errors (``causes``) that explain most of what the points correct."""
+    assert fused.tracks.camera_matrix is not None
+    causes = single_causes(fused.given, fused.path, fused.tracks.camera_matrix, path_config(config))
+    return replace(fused, measured=fused.measured | {"causes": causes})
 
 
 def _of_window(

@@ -11,7 +11,7 @@ _PLANES = 1000
 _ON_PLANE = 0.03
 #: Points on the plane, at least, and share of all.
 LEAST_ON_PLANE = 20
-_LEAST_SHARE = 0.15
+LEAST_SHARE = 0.15
 
 
 class GroundPlane(NamedTuple):
@@ -41,6 +41,6 @@ def largest_plane(places: np.ndarray, position: np.ndarray, up: np.ndarray, with
     normal, level, height = normal[usual], level[usual], height[usual]
     on = (np.abs(places @ normal.T - level) < _ON_PLANE * height).sum(axis=0)
     best = int(on.argmax())
-    if on[best] < max(LEAST_ON_PLANE, _LEAST_SHARE * len(places)):
+    if on[best] < max(LEAST_ON_PLANE, LEAST_SHARE * len(places)):
         return None
     return GroundPlane(normal[best], float(level[best]))

@@ -21,7 +21,7 @@ _NEARER = 75
 
 
 class Pair(NamedTuple):
-    """Two keyframes, the parallax (rad) of the nearer points, and how much it tells."""
+    """Two keyframes, the parallax (rad) of the nearer points, and their worth as a beginning."""
 
     first: int
     second: int
@@ -41,7 +41,7 @@ def candidate_pairs(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> 
             if len(both.piece) < _LEAST_COMMON:
                 continue
             _, angle = turn_between(rays(both.first, matrix), rays(both.second, matrix))
-            # What is far shows none: that of the nearer points tells.
+            # Far points have no parallax: that of the nearer points counts.
             parallax = float(np.percentile(angle, _NEARER))
             score = min(parallax, ENOUGH_PARALLAX) * float(np.sqrt(len(both.piece)))
             found.append(Pair(first, first + lag, parallax, score))

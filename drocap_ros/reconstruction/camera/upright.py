@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.contacts import ANKLES, rest_likelihood
-from drocap_ros.reconstruction.camera.ground_plane import LEAST_ON_PLANE, largest_plane
+from drocap_ros.reconstruction.camera.ground_plane import LEAST_ON_PLANE, LEAST_SHARE, largest_plane
 from drocap_ros.reconstruction.world.metric_scale import estimate_scale
 from drocap_ros.skeleton import BODY_17
 
@@ -40,8 +40,6 @@ FEET_HZ = 2.0
 #: The same of a point of the ground, and distance (m) from the feet up to which points count.
 _GROUND_STD_M = 0.1
 _GROUND_M = 15.0
-#: Share of the points within the distance that lie on the ground's plane, at least.
-_GROUND_SHARE = 0.15
 #: Times (s) between two places of a foot that rests, and error (m) of its place.
 _REST_S = 0.25
 _REST_M = 0.05
@@ -243,7 +241,7 @@ def _by_points(plane: _Plane, feet: np.ndarray, points: np.ndarray) -> _Plane | 
     found = _fit(floor, places, np.ones(len(places)), _GROUND_STD_M, hold_height=True)
     off = np.abs(places @ found.up - found.height)
     on = int((off < 2 * _GROUND_STD_M).sum())
-    if on < max(LEAST_ON_PLANE, _GROUND_SHARE * len(places)):
+    if on < max(LEAST_ON_PLANE, LEAST_SHARE * len(places)):
         return None
     return found._replace(height=found.height + _ANKLE_M)
 

@@ -44,7 +44,7 @@ class FeatureNetwork:
         if outputs != _OUTPUTS:
             raise InputError(
                 f"{path}: expected a lifter (features {FEATURES} -> {_OUTPUTS}), got {inputs} -> {outputs};"
-                " train one by drocap train-lifter"
+                " train one by python -m lab train-lifter"
             )
 
     @property

@@ -56,13 +56,14 @@ def _calibrations(windows: list[Mapping[str, Any]], height_m: float | None) -> s
 
 
 def _causes(windows: list[Mapping[str, Any]]) -> str:
-    """The single error, or errors that are not told apart, by which points explain most of what they correct."""
+    """The single error, or those that points cannot distinguish, that explain most of what the points correct."""
     causes = windows[0].get("causes") or []
     named = [f"{c['cause']} corrected by {_size(c['size'], c['std'], c['unit'])}" for c in causes]
     if not named:
         return ""
     share = f"explains {100 * causes[0]['explains']:.0f} % of what the points contradict"
-    return f"{named[0]} {share}" if len(named) == 1 else f"{' or '.join(named)} {share}; they are not told apart"
+    doubt = "; the points cannot distinguish them" if len(named) > 1 else ""
+    return f"{' or '.join(named)} {share}{doubt}"
 
 
 def _corrections(windows: list[Mapping[str, Any]]) -> list[str]:

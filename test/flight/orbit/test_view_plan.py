@@ -1,6 +1,8 @@
 """The place that a plan chooses, and the way there."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -85,3 +87,17 @@ def test_a_planned_flight_arrives_and_swings_about_its_place():
     assert places[-1, 2] == pytest.approx(4.0, abs=0.05)
     np.testing.assert_allclose(np.hypot(*places[:, :2].T), 6.0, atol=0.1)
     assert np.abs(np.diff(bearings)).max() < 1.01 * 1.76 / 6.0 * step_s
+
+
+def test_a_choice_in_flight_imports_no_solver():
+    """The first one would stop the control loop for as long as that takes."""
+    code = (
+        "import sys, numpy as np; from drocap_ros.flight.orbit.view_plan import *; "
+        "import drocap_ros.flight.orbit.controller; "
+        "grid = [v.ravel() for v in np.meshgrid(np.arange(0.0, 360.0, 45.0), [10.0, 35.0])]; "
+        "views = ViewForecast(*grid, np.linspace(0.02, 0.05, 16), 0.0); before = set(sys.modules); "
+        "choose_view(views, (0.0, 2.5), Reach(6.0, 15.0, 1.0, (1.3, 19.5)), None, 0.0); "
+        "print(sorted(set(sys.modules) - before))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"

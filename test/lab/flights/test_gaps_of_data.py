@@ -13,7 +13,7 @@ from drocap_ros.flight.orbit.states import Action, Command, State
 from lab.flights.fault_injections import freeze
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
-FAULT_S = 8.0
+FAULT_S = 12.0
 
 
 def orbit(autopilot, **config):

@@ -25,10 +25,10 @@ def _missed(autopilot: str, action: str):
     ],
 )  # fmt: skip
 def test_orbit_in_wind_keeps_radius_heading_and_distance(autopilot, action):
-    settings = LoopSettings(autopilot=autopilot, action=action, wind_m_s=WIND, seed=2, seconds=26)
+    settings = LoopSettings(autopilot=autopilot, action=action, wind_m_s=WIND, seed=2, seconds=32)
     loop = OrbitLoop(with_config(settings, body_height_m=1.75))  # the other parameters have their defaults
     loop.start()
-    loop.run(25.0)
+    loop.run(31.0)
     quality = orbit_quality(loop, 6.0, 13.0)
     assert quality.orbiting == 1.0, loop.reasons[-3:]
     assert quality.radius_error_m <= 0.3

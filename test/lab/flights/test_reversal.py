@@ -10,10 +10,10 @@ from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 @pytest.mark.parametrize("changes", [{"reverse_every_s": 10.0}, {"calibrate_telemetry": True}])
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_orbit_turns_without_a_hold(autopilot, changes):
-    settings = LoopSettings(autopilot=autopilot, seed=2, distance_m=6.5, seconds=31.0)
+    settings = LoopSettings(autopilot=autopilot, seed=2, distance_m=6.5, seconds=36.0)
     loop = OrbitLoop(with_config(settings, body_height_m=1.75, size_error=0.04, **changes))
     loop.start()
-    loop.run(30.0)
+    loop.run(35.0)
     rows = [row for row in loop.rows if row.t_s > 12.0]
     assert all(row.state == State.ORBITING for row in rows)
     assert max(abs(row.distance_m - 6.0) for row in rows) < 1.2

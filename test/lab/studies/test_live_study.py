@@ -70,13 +70,14 @@ def test_live_poses_of_unseen_people_are_near_the_offline_ones(shared, tmp_path)
     assert refined <= 1.15 * offline
     assert latest < 45.0
     for row in rows:
+        # The lifter's deviations are right on HDM05's people; these figures err less.
         assert 0.6 <= row.refined_std <= 1.5
         assert 0.7 <= row.initial_std <= 1.5
 
 
 def test_live_poses_in_map_are_measured_beside_the_offline_ones(tmp_path):
     """With exact telemetry the refined poses in ``map`` are nearly as good as offline; the latest ones err more."""
-    truth = simulate_person(np.arange(24 * 13) / 24.0, "walk", 0, 1.75, BODY_17)
+    truth = simulate_person(np.arange(24 * 17) / 24.0, "walk", 0, 1.75, BODY_17)
     np.savez(
         tmp_path / "walk.npz", X=(1000.0 * truth[:, : len(BODY_15)]).astype(np.float32), fps=24.0,
         joints=np.array(BODY_15.joints),
@@ -84,7 +85,7 @@ def test_live_poses_in_map_are_measured_beside_the_offline_ones(tmp_path):
     (row,) = live_world_study(tmp_path, WorldCase("exact"))
     assert 2.0 < row.first_s < 12.0
     assert row.share > 0.9
-    assert row.refined.w_mm < 1.3 * row.offline.w_mm + 40.0
+    assert row.refined.w_mm < 1.3 * row.offline.w_mm + 30.0
     assert row.refined.foot_m_s < 0.2
     assert row.refined.wa_mm < row.latest.wa_mm < 250.0
     text = live_world_markdown([row], WorldCase("exact"))

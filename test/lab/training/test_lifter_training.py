@@ -69,7 +69,7 @@ def test_samples_are_finite_repeatable_and_mostly_show_the_target(frames):
 
 
 def test_length_and_reach_features_agree_with_the_truth():
-    batch = sample_batch(bank(), np.random.default_rng(5), 60, 64)
+    batch = sample_batch(bank(), np.random.default_rng(5), 300, 64)
     length, reach = part(batch.features, 2), part(batch.features, 3)
     given = (length > 0).all(axis=(1, 2))
     assert 0.3 < given.mean() < 0.9
@@ -77,8 +77,11 @@ def test_length_and_reach_features_agree_with_the_truth():
     true = np.median(np.linalg.norm(span, axis=-1), axis=1)
     np.testing.assert_allclose(np.median(length[given, 0] / true[given]), 1.0, atol=0.02)
     shown = reach[given] > 0
-    # Joints are drawn aside by a tenth of the size, shoulders and hips by more.
-    assert np.median(np.abs(reach[given] - np.abs(span[given][..., 2]))[shown]) < 0.2
+    # Of joints that are drawn at their places: a network draws others aside.
+    drawn = np.linalg.norm(part(batch.features, 0).reshape(*span.shape[:2], 17, 2) - batch.target[..., :2], axis=-1)
+    there = (np.median(drawn, axis=(1, 2)) < 0.03)[given]
+    assert there.sum() >= 20
+    assert np.median(np.abs(reach[given] - np.abs(span[given][..., 2]))[there][shown[there]]) < 0.15
 
 
 def test_known_camera_turns_and_gravity_agree_with_the_poses():

@@ -130,6 +130,8 @@ def test_toes_that_a_network_drew_leave_the_body_alone_and_turn_the_feet(lifter)
     np.testing.assert_array_equal(here.joints[:, :15], body.joints[:, :15])
     ankles = [BODY_17.index("rankle"), BODY_17.index("lankle")]
     feet = [found.joints[:, 15:, 1] - found.joints[:, ankles, 1] for found in (here, there)]
+    every = lifter.lift(LifterInput(low)).joints
+    np.testing.assert_allclose(feet[1], every[:, 15:, 1] - every[:, ankles, 1], atol=1e-9)
     # Feet are of one length: they follow toes that are drawn 60 lower by a third of it or more.
     assert (np.median(feet[1] - feet[0], axis=0) > 20).all()
     np.testing.assert_array_equal(lifter.lift_toes_apart(LifterInput(unseen)).joints, body.joints)
