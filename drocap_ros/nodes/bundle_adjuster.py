@@ -1,11 +1,10 @@
 """Node ``bundle_adjuster``: adjusts the last seconds of poses together.
 
-Subscribes ``pose2d``, ``pose3d/initial``, ``background``, ``vehicle/state``, ``camera_info`` and ``orbit/status`` (a
-planned orbit needs a forecast of the views); publishes
-``pose3d/refined`` (drocap_ros/Pose3DWindow), and for every image ``pose3d/latest`` (drocap_ros/Pose3D): its initial
-pose with the bone lengths of the last window, stage INITIAL until there is one.  With the camera's pose and a measured
-scale both are in ``map``, else in the camera's optical frame; ``/diagnostics`` says why.  Without any telemetry windows
-are in ``odom`` where fixed points give the camera's path, which is then on ``/tf``.
+Subscribes ``pose2d``, ``pose3d/initial``, ``background``, ``vehicle/state``, ``camera_info`` and ``orbit/status``;
+publishes ``pose3d/refined`` (drocap_ros/Pose3DWindow), ``pose3d/views`` of a planned orbit, and for every image
+``pose3d/latest`` (drocap_ros/Pose3D): its initial pose with the bone lengths of the last window, stage INITIAL until
+there is one.  With the camera's pose and a measured scale both are in ``map``, else in the camera's optical frame;
+``/diagnostics`` says why.  Without telemetry windows are in ``odom``, by the path of fixed points on ``/tf``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Node ``people_estimator``: the keypoints of persons beside the subject, each in a place of its own.
 
-Subscribes ``image/compressed`` and ``pose2d``; publishes ``person_2/pose2d`` and ``person_3/pose2d``
-(drocap_ros/Pose2D) with the image's header, ``track_id`` 0 while the place is free.  Its parameters are
-those of ``pose_estimator``.  It has a process of its own: while the machine is busy it leaves images out, and the
-subject's keypoints are the same with it and without it.
+Subscribes ``image/compressed`` and ``pose2d``; publishes ``person_2/pose2d``, ``person_3/pose2d`` (drocap_ros/Pose2D)
+with the image's header, ``track_id`` 0 while the place is free.  Its parameters are those of ``pose_estimator``.  In a
+process of its own it leaves images out while the machine is busy, and changes nothing of the subject's keypoints.
 """
 
 from __future__ import annotations

@@ -229,17 +229,12 @@ def views_from_ros(message: ViewForecast) -> ViewForecastData:
     InputError
         When the views are no whole grid, or a value is impossible.
     """
-    count = len(message.error_m)
-    bearing, elevation, error = (
-        float_array(getattr(message, name), (count,), name).astype(float)
-        for name in ("bearing_deg", "elevation_deg", "error_m")
-    )
+    count, names = len(message.error_m), ("bearing_deg", "elevation_deg", "error_m")
+    bearing, elevation, error = (float_array(getattr(message, name), (count,), name).astype(float) for name in names)
     grid = len(np.unique(bearing)) * len(np.unique(elevation))
     finite = np.isfinite([message.turn_deg_s, *bearing, *elevation, *error]).all()
     if not (0 < count == grid and finite and (error > 0.0).all()):
-        raise InputError(
-            f"error_m: expected finite errors above 0 m of a whole grid of views, got {count} of {grid} views"
-        )
+        raise InputError(f"error_m: expected finite errors above 0 m of a whole grid, got {count} of {grid} views")
     return ViewForecastData(bearing, elevation, error, float(message.turn_deg_s))
 
 

@@ -84,7 +84,7 @@ def answer_impossible_transitions(node: LifecycleNodeMixin, report: Callable[[st
 
 
 def end_state_machine(node: LifecycleNodeMixin) -> None:
-    """Let the state machine of a destroyed node go: its publisher would keep the DDS participant and its threads."""
+    """Let the state machine of a destroyed node go: its publisher would keep the DDS participant."""
     node._state_machine = None
 
 
