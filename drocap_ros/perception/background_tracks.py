@@ -19,7 +19,7 @@ _MOST = 160  # points at a time, and cells of the grid: ten times the least numb
 _ENOUGH = 80  # of them: with fewer, cells take more than one
 _IN_A_CELL = 3  # most that one takes, and that may gather there as the camera backs off
 _GRADIENT = 2.5  # grey values per px along an edge's own direction, root mean square: sky, water and walls have less
-_FAINT = 1.5  # where an image has too few of these: three times the noise of pictures; concrete and snow have it
+_FAINT = 1.0  # where an image has too few of these: twice the noise of pictures; concrete and snow have it
 _BLOCK_PX = 5  # over which that is measured, in the image at half the size
 #: Least gradient of a corner, and points of its cell with it: in this order, until there are enough.
 _SEARCHES = (*((_GRADIENT, most) for most in range(1, _IN_A_CELL + 1)), (_FAINT, 1))

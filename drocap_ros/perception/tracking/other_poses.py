@@ -45,8 +45,8 @@ class OtherPoses:
         self, image: np.ndarray, stamp_ns: int, subject: Subject, pose: BodyPose, found: Detections, shedding: bool
     ) -> tuple[Subject, BodyPose]:
         """Subject and pose, or those of a detection in whose pose the belief is clearly greater: it was a shadow."""
-        belief = pose.belief(image, subject.box)
-        if belief >= CLEAR_CONFIDENCE:
+        first = belief = pose.belief(image, subject.box)
+        if first >= CLEAR_CONFIDENCE:
             return subject, pose
         boxes = found.boxes.astype(float)
         # Of a box around person and shadow, the clear joints are the person's.
@@ -59,7 +59,7 @@ class OtherPoses:
             if others_belief >= max(CONFIRM_CONFIDENCE, belief + _BETTER):
                 subject = self._tracker.exchange(image, stamp_ns, boxes[j], float(scores[j]))
                 pose, belief = other, others_belief
-            else:
+            elif others_belief < max(CONFIRM_CONFIDENCE, first + _BETTER):  # not only than a better one of this image
                 self._rejected.append((boxes[j], stamp_ns))
         return subject, pose
 

@@ -196,9 +196,9 @@ def test_person_who_crosses_is_not_followed(seed):
     assert ids == {1}
 
 
-@pytest.mark.parametrize(("elevation", "height"), [(68.0, 100.0)])
-def test_small_steep_person_is_told_from_a_box_around_person_and_shadow(elevation, height):
-    scene = FieldScene("small, steep", 12, elevation, height, shadow=True, duration_s=4.0)
+@pytest.mark.parametrize("seed", [12, 13])
+def test_small_steep_person_is_told_from_a_box_around_person_and_shadow(seed):
+    scene = FieldScene("small, steep", seed, 68.0, 100.0, shadow=True, duration_s=4.0)
 
     def detections(i: int, image: FieldImage):
         both = (union(image.box, image.shadow), 0.7)
@@ -206,7 +206,7 @@ def test_small_steep_person_is_told_from_a_box_around_person_and_shadow(elevatio
 
     right, ids = followed(scene, detections)
     alone = [r for i, r in enumerate(right) if i % 3]  # with a box of the person alone
-    assert np.mean(alone) >= 0.9
+    assert np.mean(alone) >= 0.96
     assert ids == {1}
 
 
