@@ -114,7 +114,7 @@ class MavlinkBridgeNode(ComponentNode):
             return
         for thread in self._threads:
             thread.start()
-        self._watchdog.start()
+        self._watchdog.start(self.now_s)
         if self.config.commands_enabled:
             self._guardian = GuardianProcess(self.config.watchdog_s)
             self._link.guardian = self._guardian.take
@@ -171,8 +171,7 @@ class MavlinkBridgeNode(ComponentNode):
     def _take_commands(self) -> None:
         # All that wait, so that a stop precedes the others; a flood must not delay the step.
         for _ in range(_MAX_REQUESTS):
-            taken = self.requests.take()
-            if taken is None:
+            if (taken := self.requests.take()) is None:
                 return
             request, header = taken
             command = OperatorCommand(
@@ -248,6 +247,8 @@ class MavlinkBridgeNode(ComponentNode):
         self._calibrated_size = size
 
     def _on_second(self) -> None:
+        if self._guardian is not None:
+            self._guardian.revive()
         publishers = self.get_publishers_info_by_topic(self.resolve_topic_name("pose2d"))
         self._rivals.set_names(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
         status = self._link.status()

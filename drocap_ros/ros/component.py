@@ -135,8 +135,8 @@ class ComponentNode(Node):
         return int(self.get_clock().now().nanoseconds)
 
     def now_s(self) -> float:
-        """Clock of periods and ages, s: monotonic, or the simulated time."""
-        return self.now_ns() * 1e-9 if self.simulated else time.monotonic()
+        """Clock of periods and ages, s: monotonic, also while the machine is suspended, or the simulated time."""
+        return self.now_ns() * 1e-9 if self.simulated else time.clock_gettime(time.CLOCK_BOOTTIME)
 
     def _watch_clock(self) -> None:
         """Publish the status while the simulated time stands still, and with it the timer that does so."""

@@ -2,7 +2,8 @@
 
 In each step of an orbit the bridge hands over the packets that hold the vehicle where it is, and the port.  The
 guardian sends them, one after the other, when that process has ended, or has been silent for a time.  It requests no
-mode and reads nothing: an autopilot in another mode ignores the packets.  It then gives up the port and ends.
+mode and reads nothing: an autopilot in another mode ignores the packets.  It then gives up the port and ends.  Orders
+bear the time at which the bridge gave them, of a clock that a suspended machine does not stop: what waited is not sent.
 
 This file is its program too.  It imports nothing but the standard library: what fails there fails in no other place.
 """
@@ -14,6 +15,7 @@ import json
 import logging
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -28,9 +30,11 @@ if TYPE_CHECKING:
 #: vehicle stands by then: it brakes at 1.3 m/s^2 and more, from 2.3 m/s at most (``max_coast_m``).
 PACKETS, PERIOD_S = 8, 0.2
 _CHECK_S = 0.02  # as the watchdog's
-_STOOD_S = 0.5  # for which the guardian stood too: the autopilot's time-out has ended the motion
+_OUTDATED_S = 0.5  # since the vehicle was sent anything: the autopilot's time-out has ended the motion
 _LONGEST_ORDER = 16384  # bytes: eight signed packets of 73 in digits are 1.3 kB
-_ENDS_S = 1.0  # until an idle one has ended
+_ENDS_S = PACKETS * PERIOD_S + 0.5  # until it has ended, one that holds too
+#: What ends a group of processes, as a service manager does with those that a dead bridge leaves: it ends by itself.
+_IGNORED = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +50,7 @@ class Guardian:
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
         self._packets: list[bytes] = []
-        self._heard_s = self._checked_s = self._sent_s = -1e18
+        self._heard_s = self._sent_s = -1e18
         self.ended = False  # the bridge's process
 
     @property
@@ -54,14 +58,13 @@ class Guardian:
         """Whether there is anything to be sent."""
         return bool(self._packets)
 
-    def take(self, now_s: float, packets: Sequence[bytes]) -> None:
-        """Take what the bridge hands over; nothing: it commands nothing."""
-        self._heard_s, self._packets = now_s, list(packets)
+    def take(self, given_s: float, packets: Sequence[bytes]) -> None:
+        """Take what the bridge gave at a time; nothing: it commands nothing."""
+        self._heard_s, self._packets = given_s, list(packets)
 
     def due(self, now_s: float) -> bytes | None:
         """The packet to send now."""
-        gap_s, self._checked_s = now_s - self._checked_s, now_s
-        if gap_s > _STOOD_S:
+        if now_s - max(self._heard_s, self._sent_s) > _OUTDATED_S:
             self._packets = []  # of another place than the present one
         silent = self.ended or now_s - self._heard_s > self._limit_s
         if not (silent and self._packets and now_s - self._sent_s >= PERIOD_S):
@@ -79,28 +82,41 @@ class GuardianProcess:
     """
 
     def __init__(self, limit_s: float) -> None:
+        self._limit_s, self._armed, self._lost = limit_s, False, False
+        self._start()
+
+    def _start(self) -> None:
         self._channel, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._channel.setblocking(False)
         with channel:
             # In a session of its own, so that what ends the bridge's group does not end it.
             self._process = subprocess.Popen(
-                [sys.executable, "-I", __file__, str(channel.fileno()), str(limit_s)],
+                [sys.executable, "-I", __file__, str(channel.fileno()), str(self._limit_s)],
                 pass_fds=(channel.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 start_new_session=True,
             )
-        self._armed = self._lost = False
+
+    def revive(self) -> None:
+        """Start another one where it has ended, whatever killed it."""
+        if (status := self._process.poll()) is not None:
+            logger.warning("the guardian of the link has ended with status %d: started again", status)
+            self._channel.close()
+            self._start()
 
     def take(self, packets: Sequence[bytes], transport: Transport) -> None:
         """Hand over packets and the port of the transport; it never waits, and never raises."""
         if not packets and not self._armed:
             return
-        descriptor, peer = transport.port()
-        order = json.dumps({"peer": peer, "packets": [packet.hex() for packet in packets]}).encode()
+        order: dict[str, object] = {"given_s": _now_s(), "packets": [packet.hex() for packet in packets], "peer": None}
+        descriptors: list[int] = []
         try:
-            socket.send_fds(self._channel, [order], [descriptor] if packets else [])
+            if packets:
+                descriptor, order["peer"] = transport.port()
+                descriptors = [descriptor]
+            socket.send_fds(self._channel, [json.dumps(order).encode()], descriptors)
         except OSError as error:
             if not self._lost:
                 logger.warning("the guardian of the link does not answer (%s): it holds nothing", error)
@@ -109,12 +125,13 @@ class GuardianProcess:
         self._armed, self._lost = bool(packets), False
 
     def close(self) -> None:
-        """Let it end; what it would have to send is sent by nobody."""
-        with contextlib.suppress(OSError):
-            self._channel.send(json.dumps({"peer": None, "packets": []}).encode())
+        """Let it end; a motion that was commanded last, and not ended, is held until then."""
         self._channel.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
+        try:
             self._process.wait(_ENDS_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()  # it stands still, and would keep the port
+            self._process.wait()
 
 
 class _Port:
@@ -143,6 +160,11 @@ class _Port:
                 shared.sendto(packet, self._peer)
 
 
+def _now_s() -> float:
+    """Time of this machine, which goes on while it is suspended."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
 def main(channel: socket.socket, limit_s: float) -> None:
     """Take what the bridge hands over, until its process ends; then hold, where it has commanded motion."""
     guardian, port = Guardian(limit_s), _Port()
@@ -155,10 +177,13 @@ def main(channel: socket.socket, limit_s: float) -> None:
             if data:
                 order = json.loads(data)
                 port.take(descriptors, order["peer"])
-                guardian.take(time.monotonic(), [bytes.fromhex(packet) for packet in order["packets"]])
-        if (packet := guardian.due(time.monotonic())) is not None:
+                guardian.take(order["given_s"], [bytes.fromhex(packet) for packet in order["packets"]])
+            continue  # a newer order may wait
+        if (packet := guardian.due(_now_s())) is not None:
             port.write(packet)
 
 
 if __name__ == "__main__":
+    for ignored in _IGNORED:
+        signal.signal(ignored, signal.SIG_IGN)
     main(socket.socket(fileno=int(sys.argv[1])), float(sys.argv[2]))

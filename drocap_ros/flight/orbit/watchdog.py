@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -86,9 +85,9 @@ class Watchdog:
         self.fired = self.mode_requested = False
         return result
 
-    def start(self) -> None:
-        """Watch in a thread, in real time."""
-        self._thread = threading.Thread(target=self._run, name="flight-watchdog", daemon=True)
+    def start(self, now_s: Callable[[], float]) -> None:
+        """Watch in a thread, by the clock of :meth:`kick`."""
+        self._thread = threading.Thread(target=self._run, args=(now_s,), name="flight-watchdog", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -97,6 +96,6 @@ class Watchdog:
         if self._thread is not None:
             self._thread.join(1.0)
 
-    def _run(self) -> None:
+    def _run(self, now_s: Callable[[], float]) -> None:
         while not self._stop.wait(_CHECK_S):
-            self.step(time.monotonic())
+            self.step(now_s())

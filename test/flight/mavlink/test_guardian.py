@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -15,25 +16,37 @@ import pytest
 from drocap_ros.flight.mavlink.guardian import PACKETS, PERIOD_S, Guardian, GuardianProcess
 from drocap_ros.flight.mavlink.transport import open_transport
 
-#: A bridge that hands over its hold, and ends as its last argument says.
+#: A bridge that hands over its hold, and ends as its last argument says; the first ones happen before.
 _BRIDGE = """
 import os, signal, sys, time
+from pathlib import Path
 from drocap_ros.flight.mavlink.guardian import GuardianProcess
 from drocap_ros.flight.mavlink.transport import open_transport
 
 transport = open_transport(sys.argv[1])
 transport.write(b"orbit")
 guardian = GuardianProcess(0.2)
+child = int(Path(f"/proc/self/task/{os.getpid()}/children").read_text())
+before, end = sys.argv[2:-1], sys.argv[-1]
+if "stands" in before:
+    os.kill(child, signal.SIGSTOP)
+    print(child, flush=True)
 for i in range(20):
     guardian.take([b"hold %d %d" % (i, n) for n in range(8)], transport)
     time.sleep(0.02)
-if sys.argv[2] == "idle":
+if "idle" in before:
     guardian.take([], transport)
-    sys.argv[2] = "SIGKILL"
-if sys.argv[2] == "close":
+if "asked to end" in before:
+    ignored = lambda: int(Path(f"/proc/{child}/status").read_text().split("SigIgn:")[1].split()[0], 16)
+    while not ignored() >> signal.SIGTERM - 1 & 1:  # until it has started
+        guardian.take([b"hold 19 %d" % n for n in range(8)], transport)
+        time.sleep(0.02)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        os.kill(child, number)
+if end == "close":
     guardian.close()
 else:
-    os.kill(os.getpid(), getattr(signal, sys.argv[2]))
+    os.kill(os.getpid(), getattr(signal, end))
 """
 _STEP_S = 0.02
 
@@ -62,11 +75,13 @@ def test_packets_are_sent_once_the_bridge_has_ended_or_is_silent(ended, after_s)
     assert not guardian.armed
 
 
+@pytest.mark.parametrize("ended", [True, False])
 @pytest.mark.parametrize("packets", [HOLD, []], ids=["orbit", "idle"])
-def test_nothing_is_sent_by_one_that_stood_still_itself_or_where_nothing_was_commanded(packets):
+def test_nothing_is_sent_by_one_that_stood_still_itself_or_where_nothing_was_commanded(packets, ended):
     guardian = Guardian(0.2)
     guardian.due(0.98)
     guardian.take(1.0, packets)
+    guardian.ended = ended
     assert sent(guardian, 1.0 if not packets else 3.0, 6.0) == ([], [])
     guardian.take(6.0, HOLD)
     assert sent(guardian, 6.0, 8.0)[1] == HOLD  # the next step of an orbit arms it again
@@ -88,12 +103,16 @@ def heard(vehicle, quiet_s):
     return found
 
 
-def bridge(vehicle, end):
-    return subprocess.Popen([sys.executable, "-c", _BRIDGE, f"udpout:127.0.0.1:{vehicle.getsockname()[1]}", end])
+def bridge(vehicle, *end):
+    url = f"udpout:127.0.0.1:{vehicle.getsockname()[1]}"
+    return subprocess.Popen([sys.executable, "-c", _BRIDGE, url, *end], stdout=subprocess.PIPE)
 
 
-def test_a_killed_bridge_holds_by_its_own_port_and_gives_it_up(vehicle):
-    with bridge(vehicle, "SIGKILL"):
+@pytest.mark.parametrize(
+    "end", [("SIGKILL",), ("asked to end", "SIGKILL"), ("close",)], ids=["killed", "service stopped", "orbit not ended"]
+)
+def test_a_bridge_that_ends_in_an_orbit_holds_by_its_own_port_and_gives_it_up(vehicle, end):
+    with bridge(vehicle, *end):
         found = heard(vehicle, 3.0)
     packets, senders = zip(*found, strict=True)
     assert packets == (b"orbit", *(b"hold 19 %d" % n for n in range(PACKETS)))
@@ -115,20 +134,78 @@ def test_a_stopped_bridge_holds(vehicle):
     assert not select.select([vehicle], [], [], 1.0)[0]
 
 
-@pytest.mark.parametrize("end", ["idle", "close"])
+def test_what_waited_for_a_guardian_that_stood_is_not_sent(vehicle):
+    """Neither where the bridge has died meanwhile, nor later."""
+    with bridge(vehicle, "stands", "SIGKILL") as process:
+        guardian = int(process.stdout.readline())
+        process.wait()
+        time.sleep(0.6)
+        os.kill(guardian, signal.SIGCONT)
+        assert [packet for packet, _ in heard(vehicle, 3.0)] == [b"orbit"]
+
+
+@pytest.mark.parametrize("end", ["SIGKILL", "close"])
 def test_a_bridge_that_commands_nothing_ends_without_a_word(vehicle, end):
-    with bridge(vehicle, end):
+    with bridge(vehicle, "idle", end):
         assert [packet for packet, _ in heard(vehicle, 2.0)] == [b"orbit"]
 
 
-def test_a_port_without_datagrams_is_shared_too():
+def child():
+    """The process of the one guardian of this process."""
+    return int(Path(f"/proc/self/task/{os.getpid()}/children").read_text())
+
+
+@pytest.fixture
+def pipe():
     read, write = os.pipe()
-    guardian = GuardianProcess(0.2)
-    for _ in range(50):  # until it has started
-        guardian.take([b"hold"], SimpleNamespace(port=lambda: (write, None)))
-        time.sleep(0.02)
-    assert select.select([read], [], [], 20.0)[0]
-    assert os.read(read, 100) == b"hold"
-    guardian.close()
+    yield read, SimpleNamespace(port=lambda: (write, None))
     os.close(read)
     os.close(write)
+
+
+def holds(guardian, read, transport):
+    """Whether it sends what it was given last."""
+    for _ in range(50):  # until it has started
+        guardian.take([b"hold"], transport)
+        time.sleep(0.02)
+    return bool(select.select([read], [], [], 20.0)[0]) and os.read(read, 100) == b"hold"
+
+
+def test_a_port_without_datagrams_is_shared_too(pipe):
+    guardian = GuardianProcess(0.2)
+    assert holds(guardian, *pipe)
+    guardian.close()
+
+
+def test_a_guardian_that_was_killed_is_started_again(pipe, caplog):
+    guardian = GuardianProcess(0.2)
+    guardian.revive()
+    assert not caplog.records
+    os.kill(killed := child(), signal.SIGKILL)
+    os.waitid(os.P_PID, killed, os.WEXITED | os.WNOWAIT)
+    guardian.take([b"hold"], pipe[1])
+    guardian.revive()
+    assert "ended with status -9: started again" in caplog.text
+    assert holds(guardian, *pipe)
+    guardian.close()
+
+
+def test_a_guardian_that_stands_does_not_keep_the_port(pipe):
+    guardian = GuardianProcess(0.2)
+    guardian.take([b"hold"], pipe[1])
+    os.kill(stands := child(), signal.SIGSTOP)
+    guardian.close()
+    assert not Path(f"/proc/{stands}").exists()
+
+
+def test_a_port_that_is_gone_does_not_stop_the_bridge(pipe):
+    """A device that was pulled out: its driver's port has no descriptor, and raises."""
+
+    def port():
+        raise OSError("port is not open")
+
+    guardian, gone = GuardianProcess(0.2), SimpleNamespace(port=port)
+    guardian.take([b"hold"], pipe[1])
+    guardian.take([b"hold"], gone)
+    guardian.take([], gone)
+    guardian.close()
