@@ -55,12 +55,14 @@ class PathEquations:
         views, knots, frames = r.data.views, r.data.knots, r.data.path.frames
         camera = r.image_derivatives[2]
         order, place = views.by_frame
-        by_view = np.zeros((frames, int(place.max(initial=0)) + 1, 2, KNOT + SHARED))
+        by_view = np.zeros((frames, int(place.max(initial=0)) + 1, 2, camera.shape[2]))
         by_view[views.frame[order], place] = camera[order]
-        columns = by_view.reshape(frames, -1, KNOT + SHARED)
+        columns = by_view.reshape(frames, -1, camera.shape[2])
         own = np.swapaxes(columns, 1, 2) @ columns
         self.of_frame = own[:, :KNOT, :KNOT]
-        self.corner = own[:, KNOT:, KNOT:].sum(axis=0) + r.weights.shared + np.diag((~r.weights.free).astype(float))
+        self._free = r.weights.free
+        self.corner = r.weights.shared + np.diag((~self._free).astype(float))
+        self.corner[np.ix_(self._free, self._free)] += own[:, KNOT:, KNOT:].sum(axis=0)
         band = np.zeros((self._rows // KNOT, self._reach, KNOT, KNOT))
         self.border: np.ndarray = np.zeros((self._rows, SHARED))
         at, share = knots.before, knots.share
@@ -70,9 +72,10 @@ class PathEquations:
             (1, at, share * (1.0 - share)),
         ):
             np.add.at(band[:, reach], first, weight[:, None, None] * self.of_frame)
-        by_knot = self.border.reshape(-1, KNOT, SHARED)
+        by_knot = np.zeros((self._rows // KNOT, KNOT, int(self._free.sum())))
         np.add.at(by_knot, at, (1.0 - share)[:, None, None] * own[:, :KNOT, KNOT:])
         np.add.at(by_knot, at + 1, share[:, None, None] * own[:, :KNOT, KNOT:])
+        self.border[:, self._free] = by_knot.reshape(self._rows, -1)
         width = KNOT * self._reach
         self.band: np.ndarray = np.zeros((self._rows, width))
         row = np.arange(KNOT)
@@ -131,11 +134,12 @@ class PathEquations:
             block = self._knots[group].reshape(-1, width)
             square[:, :width] = block.T @ block
             self.band[rows] -= by_distance
-            self.border[rows] -= block.T @ self._shared[group].reshape(-1, SHARED)
+            self.border[rows, self._free] -= block.T @ self._shared[group].reshape(len(block), self._shared.shape[2])
             self.right[rows] -= block.T @ self._points[group].reshape(-1)
-        flat = self._shared.reshape(-1, SHARED)
-        self.corner -= flat.T @ flat
-        self.right_shared = self._gradient[1] - flat.T @ self._points.reshape(-1)
+        flat = self._shared.reshape(self._points.size, self._shared.shape[2])
+        self.corner[np.ix_(self._free, self._free)] -= flat.T @ flat
+        self.right_shared = self._gradient[1].copy()
+        self.right_shared[self._free] -= flat.T @ self._points.reshape(-1)
         used = KNOT * knots.count
         self.band, self.border, self.right = self.band[:used], self.border[:used], self.right[:used]
 
@@ -152,7 +156,7 @@ class PathEquations:
         knots = backward(factor, y[:, :1] - y[:, 1:] @ shared[:, None])[:, 0]
         reached = np.concatenate([knots, np.zeros(KNOT * self._reach)])
         near = reached[KNOT * self._first[:, None] + np.arange(self.band.shape[1])]
-        inside = self._points + np.einsum("jik,jk->ji", self._knots, near) + self._shared @ shared
+        inside = self._points + np.einsum("jik,jk->ji", self._knots, near) + self._shared @ shared[self._free]
         points = -np.einsum("jki,jk->ji", self._inverse, inside)
         errors = knots.reshape(-1, KNOT)
         return Step(errors, shared, points)

@@ -162,7 +162,7 @@ class PathResiduals:
     def image_derivatives(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residuals (N, 2) at the present robust weight, and their derivatives by points and by camera.
 
-        By the point (N, 2, 3), and by the camera (N, 2, KNOT + SHARED): a frame's error, and the shared unknowns.
+        By the point (N, 2, 3), and by the camera (N, 2, KNOT + U): a frame's error, and the U free shared unknowns.
         """
         data, state, views = self.data, self.state, self.data.views
         frame, root = views.frame, self.robust / data.config.noise_px
@@ -182,14 +182,15 @@ class PathResiduals:
         lever = by_place @ tangents(state.points)[views.piece][:, :3]
         towards = -np.einsum("nki,ni->nk", by_place, (self.position / state.unit)[frame])
         by_point = lever + towards[..., None] * tangents(state.points)[views.piece][:, 3][:, None]
-        camera = np.zeros((len(frame), 2, KNOT + SHARED))
-        camera[..., :3] = by_position
-        camera[..., 3:6] = by_turn @ left_jacobian(self.turn)[frame]
-        camera[..., KNOT : KNOT + 3] = camera[..., 3:6]
-        camera[..., KNOT + ATTITUDE_LATENCY] = np.einsum("nki,ni->nk", by_turn, self.turn_rate[frame])
-        camera[..., KNOT + POSITION_LATENCY] = np.einsum("nki,ni->nk", by_position, self.velocity[frame])
-        camera[..., KNOT + FOCAL] = root[:, None] * self.focal * self.slope
-        camera[..., KNOT:] *= self.weights.free
+        of_error = np.concatenate([by_position, by_turn @ left_jacobian(self.turn)[frame]], axis=2)
+        of_shared = {
+            ATTITUDE_LATENCY: lambda: np.einsum("nki,ni->nk", by_turn, self.turn_rate[frame]),
+            POSITION_LATENCY: lambda: np.einsum("nki,ni->nk", by_position, self.velocity[frame]),
+            FOCAL: lambda: root[:, None] * self.focal * self.slope,
+        }
+        free = np.flatnonzero(self.weights.free).tolist()
+        columns = [of_shared[i]() if i in of_shared else of_error[..., 3 + i] for i in free]
+        camera = np.concatenate([of_error, *(column[..., None] for column in columns)], axis=2)
         return root[:, None] * self.image, by_point, camera
 
 
@@ -210,7 +211,8 @@ def gradient(r: PathResiduals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     errors[2:, :3] += swing
     errors[1:-1, :3] -= 2 * swing
     errors[:-2, :3] += swing
-    shared = pull[:, KNOT:].sum(axis=0) + weights.shared @ state.shared
+    shared = weights.shared @ state.shared
+    shared[weights.free] += pull[:, KNOT:].sum(axis=0)
     return errors, shared, data.views.of_pieces(np.einsum("nk,nki->ni", image, by_point))
 
 
