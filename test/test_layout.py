@@ -44,11 +44,12 @@ BUDGETS = {
     # live windows without telemetry in `odom` (0.35); covariances of the mean place (0.10); forecast of views (0.10)
     # a path goes on over the ground where a camera hovers, robust steps place it (0.20);
     # which single error of the telemetry points contradict (0.12)
-    ("flight",): 9.63,  # 3.89 over the plan: an argument or constant a line, with reasons; filter of reports, preflight
+    ("flight",): 9.67,  # 3.89 over the plan: an argument or constant a line, with reasons; filter of reports, preflight
     # and its look through the camera (0.05), who else is heard (0.02); ranges by the way about one who stands (0.07);
     # pictures wait for the camera's attitude, a trunk counts alone (0.03); a height that errs (0.02);
     # a plan's wishes, judged as an operator's (0.08), the view that it chooses (0.17);
-    # a process that holds after the bridge's death (0.24), nothing late and whatever asks it to end (0.02)
+    # a process that holds after the bridge's death (0.24), nothing late, nothing into
+    # the pilot's mode, whatever asks it to end (0.06)
     ("recording",): 5.70,  # 1.16 over the plan: every format of telemetry stayed; keypoints of other tools came (0.38)
     # and 3D poses of theirs (0.11); subtitles beside a video, units of flight logs (0.04);
     # bags without an index (0.12); points as the live graph had them (0.04);

@@ -186,7 +186,7 @@ class OrbitLoop:
         for guardian in self._guardians:
             guardian.ended = True
         self._guardians.append(guardian := Guardian(config.watchdog_s))
-        self.link.guardian = lambda packets, _: guardian.take(self.t, packets)
+        self.link.guardian = lambda packets, *_: guardian.take(self.t, packets)
         self.watchdog = Watchdog(self.link.send_unlocked, config.watchdog_s, self.link.hand_over)
         self.controller = OrbitController(self.link, config, self.watchdog)
         self.controller.on_camera(self.matrix)

@@ -86,7 +86,7 @@ def test_a_camera_info_that_was_published_once_before_the_bridge_is_heard():
 def test_an_error_in_the_control_loop_holds_the_vehicle_at_once(node, monkeypatch):
     sent = []
     monkeypatch.setattr(node._watchdog, "_send", sent.append)
-    node._watchdog.kick(node.now_s(), FallbackCommands("hold", "hold mode", lambda: True))
+    node._watchdog.kick(node.now_s(), FallbackCommands("hold", "hold mode", lambda: True, lambda: False))
     monkeypatch.setattr(node.controller, "step", lambda now_ns, now_s: 1 / 0)
     node._control()
     assert sent == ["hold"]

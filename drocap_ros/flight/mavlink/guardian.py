@@ -2,8 +2,10 @@
 
 In each step of an orbit the bridge hands over the packets that hold the vehicle where it is, and the port.  The
 guardian sends them, one after the other, when that process has ended, or has been silent for a time.  It requests no
-mode and reads nothing: an autopilot in another mode ignores the packets.  It then gives up the port and ends.  Orders
-bear the time at which the bridge gave them, of a clock that a suspended machine does not stop: what waited is not sent.
+mode, and sends nothing more once the port shows the vehicle in another one, the pilot's.  While the bridge lives, the
+port is the bridge's to read; an autopilot in another mode ignores the packets.  It then gives up the port and ends.
+Orders bear the time at which the bridge gave them, of a clock that a suspended machine does not stop: what waited is
+not sent.
 
 This file is its program too.  It imports nothing but the standard library: what fails there fails in no other place.
 """
@@ -14,13 +16,14 @@ import contextlib
 import json
 import logging
 import os
+import re
 import select
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 PACKETS, PERIOD_S = 8, 0.2
 _CHECK_S = 0.02  # as the watchdog's
 _OUTDATED_S = 0.5  # since the vehicle was sent anything: the autopilot's time-out has ended the motion
+_MOST_READ, _MAX_DATAGRAM = 100, 65535  # of what has arrived in a step, and bytes each: a flood delays no packet
 _LONGEST_ORDER = 16384  # bytes: eight signed packets of 73 in digits are 1.3 kB
 _ENDS_S = PACKETS * PERIOD_S + 0.5  # until it has ended, one that holds too
 #: What ends a group of processes, as a service manager does with those that a dead bridge leaves: it ends by itself.
@@ -106,11 +110,15 @@ class GuardianProcess:
             self._channel.close()
             self._start()
 
-    def take(self, packets: Sequence[bytes], transport: Transport) -> None:
-        """Hand over packets and the port of the transport; it never waits, and never raises."""
+    def take(self, packets: Sequence[bytes], control: tuple[int, int, int], transport: Transport) -> None:
+        """Hand over packets and the port of the transport; it never waits, and never raises.
+
+        control : system, component and custom_mode of a HEARTBEAT of the vehicle while it follows the bridge
+        """
         if not packets and not self._armed:
             return
-        order: dict[str, object] = {"given_s": _now_s(), "packets": [packet.hex() for packet in packets], "peer": None}
+        order: dict[str, object] = {"given_s": _now_s(), "packets": [packet.hex() for packet in packets]}
+        order |= {"control": control, "peer": None}
         descriptors: list[int] = []
         try:
             if packets:
@@ -159,6 +167,21 @@ class _Port:
             with socket.socket(fileno=os.dup(self._descriptor)) as shared:
                 shared.sendto(packet, self._peer)
 
+    def read(self) -> Iterator[bytes]:
+        """What has arrived, once nobody else reads it."""
+        with contextlib.suppress(OSError):
+            for _ in range(_MOST_READ):
+                if self._descriptor is None or not select.select([self._descriptor], [], [], 0.0)[0]:
+                    return
+                yield os.read(self._descriptor, _MAX_DATAGRAM)
+
+
+def has_left(data: bytes, control: Sequence[int]) -> bool:
+    """Whether a HEARTBEAT of MAVLink 2 in the data shows another mode of the vehicle than ``control``."""
+    system, component, mode = control
+    message = rb"\xfd.{4}" + re.escape(bytes((system, component, 0, 0, 0))) + rb"(.{4})"
+    return any(found[1] != mode.to_bytes(4, "little") for found in re.finditer(message, data, re.DOTALL))
+
 
 def _now_s() -> float:
     """Time of this machine, which goes on while it is suspended."""
@@ -167,16 +190,19 @@ def _now_s() -> float:
 
 def main(channel: socket.socket, limit_s: float) -> None:
     """Take what the bridge hands over, until its process ends; then hold, where it has commanded motion."""
-    guardian, port = Guardian(limit_s), _Port()
+    guardian, port, control = Guardian(limit_s), _Port(), (0, 0, 0)
     while guardian.armed or not guardian.ended:
         if guardian.ended:
             time.sleep(_CHECK_S)
+            if any(has_left(part, control) for part in port.read()):
+                guardian.take(_now_s(), [])
         elif select.select([channel], [], [], _CHECK_S if guardian.armed else None)[0]:
             data, descriptors, *_ = socket.recv_fds(channel, _LONGEST_ORDER, 1)
             guardian.ended = not data
             if data:
                 order = json.loads(data)
                 port.take(descriptors, order["peer"])
+                control = order["control"]
                 guardian.take(order["given_s"], [bytes.fromhex(packet) for packet in order["packets"]])
             continue  # a newer order may wait
         if (packet := guardian.due(_now_s())) is not None:

@@ -77,7 +77,7 @@ class MavlinkLink:
             Packer(config.system_id, config.component_id, key, clock_ns(), link_id) for link_id in range(3)
         )
         #: Takes the packets of each step that hold the vehicle, and the port, for the time after this process.
-        self.guardian: Callable[[list[bytes], Transport], None] | None = None
+        self.guardian: Callable[[list[bytes], tuple[int, int, int], Transport], None] | None = None
         self._autopilot: Autopilot | None = None  # None = none is heard yet
         self._heard_s: float | None = None  # monotonic
         self._due: dict[str, float] = {}
@@ -166,10 +166,11 @@ class MavlinkLink:
 
     def hand_over(self, hold: Message | None) -> None:
         """Give the guardian a motion message for the time after this process; None = nothing is commanded."""
-        if self.guardian is None:
+        if self.guardian is None or self._autopilot is None:
             return
         packets = [] if hold is None else [self._pack(self.check_motion(hold), self._guardian) for _ in range(PACKETS)]
-        self.guardian(packets if self._broken_s is None else [], self._transport)
+        control = (*self.target, self._autopilot.modes.get(self._autopilot.control_mode, 0))
+        self.guardian(packets if self._broken_s is None else [], control, self._transport)
 
     def stream_gap_s(self) -> float:
         """Time in s since the last setpoint was sent; infinity before the first."""
@@ -295,8 +296,7 @@ class MavlinkLink:
             self.estimator.clock.exchange(message.ts1, message.tc1, now_ns)
 
     def _send_due(self) -> None:
-        config = self.config
-        if self._is_due("heartbeat", 1.0 / config.heartbeat_hz):
+        if self._is_due("heartbeat", 1.0 / self.config.heartbeat_hz):
             self._send(
                 self.mav.heartbeat_encode(
                     mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE
@@ -305,7 +305,7 @@ class MavlinkLink:
         if self._autopilot is None:
             return
         now_ns = self._clock_ns()
-        if self._is_due("time_sync", 1.0 / config.time_sync_hz):
+        if self._is_due("time_sync", 1.0 / self.config.time_sync_hz):
             if len(self._sync_sent) > _PENDING_SYNCS:
                 self._sync_sent.clear()
             self._sync_sent[now_ns] = self._monotonic_s()

@@ -228,6 +228,7 @@ class OrbitController:
                 self._link.check_motion(hold),
                 self._link.check_motion(mode),
                 lambda: self._link.fresh_mode(self._limits.max_mode_age_s) == autopilot.control_mode,
+                lambda: self._link.estimator.modes.mode != autopilot.control_mode,
             )
         self._watchdog.kick(now_s, commands)
 

@@ -20,11 +20,13 @@ class FallbackCommands(NamedTuple):
 
     in_control : whether the autopilot has just reported the mode in which it follows us; without it no mode is
         requested, because the pilot may have chosen another one
+    left : whether the last report, of any age, shows another mode: the pilot's, to whom nothing is sent
     """
 
     hold: Message
     hold_mode: Message
     in_control: Callable[[], bool]
+    left: Callable[[], bool]
 
 
 class Watchdog:
@@ -67,6 +69,9 @@ class Watchdog:
             return  # the autopilot's time-out has ended the motion; the position of the last step is outdated
         silent_s = now_s - step_s
         if commands is None or not self._limit_s < silent_s < GIVE_UP_S or now_s - self._sent_s < _PERIOD_S:
+            return
+        if commands.left():
+            self.kick(step_s, None)
             return
         self.fired, self._sent_s = True, now_s
         self._send(commands.hold)

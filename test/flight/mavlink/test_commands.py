@@ -151,7 +151,7 @@ def test_contradicting_parameters_of_the_bridge_are_refused(values, word):
 def test_watchdog_sends_the_fallback_commands_only_when_the_loop_hangs():
     sent, visible = [], False
     dog = Watchdog(sent.append, 0.2)
-    commands = FallbackCommands("hold", "mode", lambda: visible)
+    commands = FallbackCommands("hold", "mode", lambda: visible, lambda: False)
     for i in range(20):
         dog.kick(0.05 * i, commands)
         dog.step(0.05 * i + 0.02)
@@ -171,10 +171,24 @@ def test_watchdog_sends_the_fallback_commands_only_when_the_loop_hangs():
     assert sent == []
 
 
+def test_watchdog_sends_nothing_into_the_pilots_mode():
+    sent, handed, left = [], [], False
+    dog = Watchdog(sent.append, 0.2, handed.append)
+    dog.kick(1.0, FallbackCommands("hold", "mode", lambda: False, lambda: left))
+    for i in range(100):
+        left = 50 <= i < 60  # and later the pilot's mode is the bridge's again: it was his to end this
+        before = len(sent)
+        dog.step(1.02 + 0.02 * i)
+        assert i < 50 or len(sent) == before
+    assert sent == ["hold"] * len(sent)
+    assert sent
+    assert handed == ["hold", None]  # the guardian is told
+
+
 def test_watchdog_that_stood_still_with_its_loop_sends_no_outdated_position():
     sent = []
     dog = Watchdog(sent.append, 0.2)
-    commands = FallbackCommands("hold", "mode", lambda: True)
+    commands = FallbackCommands("hold", "mode", lambda: True, lambda: False)
     dog.kick(1.0, commands)
     dog.step(1.02)
     for i in range(100):  # stopped for three seconds, and the loop is not back yet

@@ -12,8 +12,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.mavlink.guardian import PACKETS, PERIOD_S, Guardian, GuardianProcess
+from drocap_ros.flight.mavlink.guardian import PACKETS, PERIOD_S, Guardian, GuardianProcess, has_left
 from drocap_ros.flight.mavlink.transport import open_transport
 
 #: A bridge that hands over its hold, and ends as its last argument says; the first ones happen before.
@@ -32,14 +33,14 @@ if "stands" in before:
     os.kill(child, signal.SIGSTOP)
     print(child, flush=True)
 for i in range(20):
-    guardian.take([b"hold %d %d" % (i, n) for n in range(8)], transport)
+    guardian.take([b"hold %d %d" % (i, n) for n in range(8)], (1, 1, 4), transport)
     time.sleep(0.02)
 if "idle" in before:
-    guardian.take([], transport)
+    guardian.take([], (1, 1, 4), transport)
 if "asked to end" in before:
     ignored = lambda: int(Path(f"/proc/{child}/status").read_text().split("SigIgn:")[1].split()[0], 16)
     while not ignored() >> signal.SIGTERM - 1 & 1:  # until it has started
-        guardian.take([b"hold 19 %d" % n for n in range(8)], transport)
+        guardian.take([b"hold 19 %d" % n for n in range(8)], (1, 1, 4), transport)
         time.sleep(0.02)
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         os.kill(child, number)
@@ -58,6 +59,7 @@ def sent(guardian, from_s, to_s):
     return [t for t, _ in found], [packet for _, packet in found]
 
 
+CONTROL = (1, 1, 4)  # ArduPilot's GUIDED
 HOLD = [bytes([i]) for i in range(PACKETS)]
 
 
@@ -120,6 +122,33 @@ def test_a_bridge_that_ends_in_an_orbit_holds_by_its_own_port_and_gives_it_up(ve
     open_transport(f"udpin:0.0.0.0:{senders[0][1]}").close()
 
 
+def heartbeat(custom_mode, system=1, component=1):
+    encoder = mavlink.MAVLink(None, system, component)
+    kind, autopilot = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    return encoder.heartbeat_encode(kind, autopilot, 81, custom_mode, mavlink.MAV_STATE_ACTIVE).pack(encoder)
+
+
+def test_the_vehicles_own_heartbeat_alone_shows_that_the_pilot_has_taken_over():
+    others = heartbeat(5, system=2) + heartbeat(0, component=154) + b"\xfd" + bytes(8) + heartbeat(4)
+    assert not has_left(others, CONTROL)
+    for mode in (5, 0, 4 + 256):
+        assert has_left(others + heartbeat(mode) + others, CONTROL)
+        assert not has_left(others + heartbeat(mode)[:-11], CONTROL)  # its rest has not come
+
+
+def test_nothing_is_sent_into_the_pilots_mode(vehicle):
+    with bridge(vehicle, "SIGKILL"):
+        found = [vehicle.recvfrom(100) for _ in range(3)]
+        vehicle.sendto(heartbeat(4), found[0][1])
+        found.append(vehicle.recvfrom(100))
+        vehicle.sendto(heartbeat(5), found[0][1])
+        time.sleep(2 * _STEP_S)
+        while select.select([vehicle], [], [], 2 * PERIOD_S)[0]:
+            found.append(vehicle.recvfrom(100))
+    assert [packet for packet, _ in found][:4] == [b"orbit", *(b"hold 19 %d" % n for n in range(3))]
+    assert len(found) < PACKETS  # one may have been on its way
+
+
 def test_a_bridge_that_starts_at_once_waits_for_the_port(vehicle):
     with bridge(vehicle, "SIGKILL"):
         packets = [vehicle.recvfrom(100) for _ in range(2)]  # the guardian has begun
@@ -166,7 +195,7 @@ def pipe():
 def holds(guardian, read, transport):
     """Whether it sends what it was given last."""
     for _ in range(50):  # until it has started
-        guardian.take([b"hold"], transport)
+        guardian.take([b"hold"], CONTROL, transport)
         time.sleep(0.02)
     return bool(select.select([read], [], [], 20.0)[0]) and os.read(read, 100) == b"hold"
 
@@ -183,7 +212,7 @@ def test_a_guardian_that_was_killed_is_started_again(pipe, caplog):
     assert not caplog.records
     os.kill(killed := child(), signal.SIGKILL)
     os.waitid(os.P_PID, killed, os.WEXITED | os.WNOWAIT)
-    guardian.take([b"hold"], pipe[1])
+    guardian.take([b"hold"], CONTROL, pipe[1])
     guardian.revive()
     assert "ended with status -9: started again" in caplog.text
     assert holds(guardian, *pipe)
@@ -192,7 +221,7 @@ def test_a_guardian_that_was_killed_is_started_again(pipe, caplog):
 
 def test_a_guardian_that_stands_does_not_keep_the_port(pipe):
     guardian = GuardianProcess(0.2)
-    guardian.take([b"hold"], pipe[1])
+    guardian.take([b"hold"], CONTROL, pipe[1])
     os.kill(stands := child(), signal.SIGSTOP)
     guardian.close()
     assert not Path(f"/proc/{stands}").exists()
@@ -205,7 +234,7 @@ def test_a_port_that_is_gone_does_not_stop_the_bridge(pipe):
         raise OSError("port is not open")
 
     guardian, gone = GuardianProcess(0.2), SimpleNamespace(port=port)
-    guardian.take([b"hold"], pipe[1])
-    guardian.take([b"hold"], gone)
-    guardian.take([], gone)
+    guardian.take([b"hold"], CONTROL, pipe[1])
+    guardian.take([b"hold"], CONTROL, gone)
+    guardian.take([], CONTROL, gone)
     guardian.close()
