@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import re
 import select
 import socket
+import termios
 import time
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
@@ -18,7 +20,7 @@ URL_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE[:
 Address: TypeAlias = tuple[str | int | bytes, ...]  # of a datagram, as its family has it
 _MAX_DATAGRAM = 65535  # bytes of UDP
 _CONNECT_TIMEOUT_S = 3.0  # of TCP, on a local network
-_TAKEN = (errno.EADDRINUSE, errno.EAGAIN)  # of UDP, of the lock of a serial port
+_TAKEN = (errno.EADDRINUSE, errno.EAGAIN, errno.EBUSY)  # of UDP, of the lock of a serial port, of its exclusive use
 #: The guardian of a bridge that died holds its port for 1.6 s at most; tried again so often.
 _HELD_S, _AGAIN_S = 2.0, 0.1
 _DEFAULT_BAUD = 57600  # of telemetry radios as shipped
@@ -108,7 +110,10 @@ def _open_serial(rest: str, url: str) -> Transport:
             "url: expected the package pyserial for serial URLs, found none; pip install pyserial"
         ) from None
     try:
-        return _SerialTransport(serial.Serial(device, int(baud), timeout=0, write_timeout=0.2, exclusive=True))
+        port = serial.Serial(device, int(baud), timeout=0, write_timeout=0.2, exclusive=True)
+        # Ground stations that open each autopilot they find heed no lock, and would read half of what comes.
+        fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+        return _SerialTransport(port)
     except (serial.SerialException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise _refusal(error)(f"url: expected a serial device that can be opened, got {url!r}: {reason}") from None
@@ -148,7 +153,7 @@ class _UdpTransport:
             return False
         try:
             self._socket.sendto(data, self._peer)
-        except (BlockingIOError, ConnectionRefusedError, OSError):
+        except OSError:
             return False
         return True
 

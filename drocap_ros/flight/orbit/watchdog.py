@@ -81,7 +81,7 @@ class Watchdog:
 
     def hold(self) -> None:
         """Send the hold of the last step, if there is one: the loop has failed, and nothing follows."""
-        if (commands := self._latest[1]) is not None:
+        if (commands := self._latest[1]) is not None and not commands.left():
             self._send(commands.hold)
 
     def take_fired(self) -> tuple[bool, bool]:

@@ -1,5 +1,7 @@
+import fcntl
 import itertools
 import math
+import os
 import random
 import socket
 import subprocess
@@ -24,6 +26,7 @@ from drocap_ros.simulation.vehicle.flight_path import orbit_path
 from drocap_ros.simulation.vehicle.mavlink_vehicle import HOME, SimulatedVehicle
 
 S = 1_000_000_000
+_TIOCGEXCL = 0x80045440  # ioctl of Linux: whether a terminal is used exclusively
 
 
 @pytest.fixture
@@ -220,6 +223,26 @@ def test_address_that_cannot_be_opened_is_refused(port):
         open_transport(f"tcp:127.0.0.1:{port}")
     with pytest.raises(InputError, match="serial"):
         open_transport("serial:/dev/does-not-exist:57600")
+
+
+def test_a_serial_port_has_one_owner_and_a_dead_bridges_guardian_is_waited_for():
+    autopilot, device = os.openpty()
+    url = f"serial:{os.ttyname(device)}:57600"
+    first = open_transport(url)
+    with pytest.raises(InputError, match=r"can be opened.*(lock|busy)"):
+        open_transport(url)
+    assert fcntl.ioctl(device, _TIOCGEXCL, bytes(4)) == b"\1\0\0\0"  # programs that heed no lock are refused too
+    shared = os.dup(first.port()[0])
+    first.close()
+    ends = threading.Timer(0.5, os.close, [shared])
+    ends.start()
+    second = open_transport(url)
+    ends.join()
+    assert second.write(b"heartbeat")
+    assert os.read(autopilot, 100) == b"heartbeat"
+    second.close()
+    os.close(autopilot)
+    os.close(device)
 
 
 class open_transport_guard:  # noqa: N801

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20.ardupilotmega import MAV_STATE_CRITICAL as CRITICAL
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Action, Command, State
+from lab.flights.fault_injections import pilot
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 
 BOTH = pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
@@ -45,6 +46,28 @@ def drop_setpoints(loop):
 
 def speed_at(loop, t_s):
     return next(float((row.velocity**2).sum() ** 0.5) for row in loop.rows if row.t_s >= t_s)
+
+
+@BOTH
+@branched
+def test_a_control_loop_that_hangs_leaves_the_pilots_mode_to_him(loop):
+    """Neither its watchdog nor the guardian sends anything more, nor does the loop when it goes on."""
+    sent, write = [], loop.up.write
+
+    def count(data):
+        sent.extend([loop.t] if data[7] == _SET_POSITION_TARGET and data[8] == 0 else [])
+        write(data)
+
+    loop.up.write, loop.hung = count, True
+    loop.run(7.8)
+    assert max(sent) > 7.6  # it is held
+    pilot("LOITER")(loop)
+    loop.run(10.0)
+    loop.hung = False
+    loop.run(12.0)
+    assert max(sent) < 8.1  # until the report has come
+    assert loop.copter.mode == "LOITER"
+    assert loop.controller.safety.state != State.ORBITING
 
 
 @BOTH
