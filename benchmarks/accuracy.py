@@ -200,19 +200,23 @@ def calibration(args: argparse.Namespace) -> None:
 
 
 def together(args: argparse.Namespace) -> None:
-    """Two drones by exact and rough telemetry, two that hold still without any, with and without fixed points."""
+    """Two drones by exact and rough telemetry, two that hold still without any, two that fly apart without any."""
     pages = []
-    cases = [
-        WorldCase("exact"),
-        WorldCase("gps"),
-        WorldCase("gps", background=True),
-        WorldCase("none", still=True),
-        WorldCase("none", still=True, background=True),
+    there_and_back = WorldCase("none", reverse_s=8.0)
+    cases: list[tuple[WorldCase, WorldCase | None]] = [
+        (WorldCase("exact"), None),
+        (WorldCase("gps"), None),
+        (WorldCase("gps", background=True), None),
+        (WorldCase("none", still=True), None),
+        (WorldCase("none", still=True, background=True), None),
+        (WorldCase("none", background=True), replace(there_and_back, background=True)),
+        (WorldCase("none", background=True), there_and_back),
+        (WorldCase("none"), there_and_back),
     ]
-    for case in cases:
+    for case, other in cases:
         with progress_bars() as progress:
-            rows = together_study(world_sequences(args.mocap, 3, args.limit), case, progress)
-        pages.append(together_markdown(rows, case))
+            rows = together_study(world_sequences(args.mocap, 3, args.limit), case, progress, other)
+        pages.append(together_markdown(rows, case, other))
     write_figures("accuracy_together", "One body in the views of two cameras", "\n".join(pages))
 
 

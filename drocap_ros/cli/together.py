@@ -30,6 +30,8 @@ _OF_ONE = {
     "camera_roll": None,
     "evidence": None,
 }
+#: Of a camera without telemetry and fixed points that moves.
+_BY_BODY = "; its camera moves as the body turns in its pictures"
 
 
 def run_together(args: argparse.Namespace) -> int:
@@ -83,16 +85,21 @@ def run_together(args: argparse.Namespace) -> int:
 
 
 def view_words(motion: Motion) -> str:
-    """A line for each further recording: its time and how well the common body fits it."""
+    """A line for each further recording: its time and how well the common body fits it; one where there is no world."""
     together = motion.meta["together"]
     lines = []
+    if motion.frame == "camera" and any(view["by_body"] for view in together["views"]):
+        lines.append(
+            "a camera moves, and no recording has telemetry or fixed points of the scene: the poses are right, a path"
+            " through a world is not known; record either with one of the cameras"
+        )
     for view in together["views"][1:]:
         first = together["views"][0]["name"]
         when = "after" if view["offset_s"] >= 0 else "before"
         lines.append(
             f"{view['name']}: its first image {abs(view['offset_s']):.3f} s (+- {1e3 * view['offset_std_s']:.1f} ms)"
             f" {when} that of {first}; keypoints {view['median_px']:.1f} px from the common body,"
-            f" {view['median_px_alone']:.1f} from its own"
+            f" {view['median_px_alone']:.1f} from its own{_BY_BODY if view['by_body'] else ''}"
         )
     return "\n".join(lines)
 

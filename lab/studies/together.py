@@ -34,29 +34,36 @@ class TogetherRow(NamedTuple):
 
 
 def together_study(
-    sequences: list[tuple[int, Sequence]], case: WorldCase, progress: Progress | None = None
+    sequences: list[tuple[int, Sequence]],
+    case: WorldCase,
+    progress: Progress | None = None,
+    other: WorldCase | None = None,
 ) -> list[TogetherRow]:
-    """Every sequence seen by two cameras; the second one's clock starts with its own first image."""
+    """Every sequence seen by two cameras; the second one's clock starts with its own first image.
+
+    other : of the second camera; None = that of the first
+    """
     return [
-        _measure(sequence, case, seed)
+        _measure(sequence, (case, other or case), seed)
         for seed, sequence in reported(sequences, len(sequences), "two cameras", progress)
     ]
 
 
-def _measure(sequence: Sequence, case: WorldCase, seed: int) -> TogetherRow:
-    first = world_view(sequence, case, seed=seed)
-    second = started_later(world_view(sequence, replace(case, camera=1), seed=seed).tracks, LATER)
+def _measure(sequence: Sequence, cases: tuple[WorldCase, WorldCase], seed: int) -> TogetherRow:
+    first = world_view(sequence, cases[0], seed=seed)
+    second = started_later(world_view(sequence, replace(cases[1], camera=1), seed=seed).tracks, LATER)
     solved = [solve_view(first.tracks), solve_view(second)]
     alone = world_errors(solved[0].motion.joints3d, first.truth, FPS)
     motion = join_views(solved, ["first", "second"])[0]
-    errors = world_errors(motion.joints3d, first.truth, FPS, motion.covariance)
+    in_world = motion.frame == "world"
+    errors = world_errors(motion.joints3d, first.truth, FPS, motion.covariance if in_world else None)
     found = motion.meta["together"]["views"][1]
     return TogetherRow(
         sequence.name,
         alone.pa_mm,
         errors.pa_mm,
         alone.w_mm if solved[0].motion.frame == "world" else float("nan"),
-        errors.w_mm,
+        errors.w_mm if in_world else float("nan"),
         100.0 * errors.scale,
         errors.coverage,
         1e3 * (found["offset_s"] - LATER / FPS),
@@ -70,7 +77,7 @@ def started_later(tracks: Tracks, images: int) -> Tracks:
     return replace(cut, stamp_ns=cut.stamp_ns - cut.stamp_ns[0])
 
 
-def together_markdown(rows: list[TogetherRow], case: WorldCase) -> str:
+def together_markdown(rows: list[TogetherRow], case: WorldCase, other: WorldCase | None = None) -> str:
     """A table with the means in its last row; offsets and scales by their size."""
     head = (
         "sequence", "PA mm, one", "two", "W-MPJPE100 mm, one", "two", "scale %", "90 % ellipsoids hold",
@@ -80,7 +87,8 @@ def together_markdown(rows: list[TogetherRow], case: WorldCase) -> str:
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     lines += [_line(row.sequence, row[1:]) for row in rows]
     lines.append(_line("mean", mean))
-    return f"## {case.words()}\n\n" + "\n".join(lines) + "\n"
+    words = case.words() if other is None else f"{case.words()}; the second camera: {other.words()}"
+    return f"## {words}\n\n" + "\n".join(lines) + "\n"
 
 
 def _line(name: str, values: tuple[float, ...] | list[float]) -> str:

@@ -10,6 +10,7 @@ import pytest
 
 from drocap_ros.cli import main
 from drocap_ros.evaluation.metrics import pa_mpjpe
+from drocap_ros.evaluation.world_scene import PinholePath, followed_points
 from drocap_ros.motion import load_motion
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
@@ -26,16 +27,22 @@ def truth(time_s: np.ndarray, action: str = "mixed") -> np.ndarray:
     return simulate_person(time_s, action, 1, 1.75, BODY_17)
 
 
-def seen_from(bearing_deg: float, time_s: np.ndarray, action: str = "mixed") -> Tracks:
-    """The person before a camera that stands: nothing but the lens is known of it."""
+def seen_from(
+    bearing_deg: float, time_s: np.ndarray, action: str = "mixed", *, speed_deg_s: float = 0.0, background: bool = False
+) -> Tracks:
+    """The person before a camera that stands or orbits: nothing but the lens is known of it, or fixed points too."""
     joints = truth(time_s, action)
     middle = np.broadcast_to(joints[:, 0].mean(axis=0), (len(joints), 3))
-    rotation, position = orbit_camera(np.zeros(len(joints)), middle, 7.0, 1.6, 0.0, bearing_deg)
+    rotation, position = orbit_camera(time_s, middle, 7.0, 1.6, speed_deg_s, bearing_deg)
     matrix = pinhole_matrix(*SIZE, 60.0)
     pixels = project(joints, rotation, position, matrix)
     pixels += np.random.default_rng(int(bearing_deg)).normal(0.0, 2.0, pixels.shape)
     stamps = np.round(np.arange(len(joints)) * 1e9 / FPS).astype(np.int64)
-    return Tracks(pixels, BODY_17.joints, stamps, SIZE, camera_matrix=matrix)
+    tracks = Tracks(pixels, BODY_17.joints, stamps, SIZE, camera_matrix=matrix)
+    if not background:
+        return tracks
+    path = PinholePath(position, rotation, float(matrix[0, 0]), SIZE)
+    return replace(tracks, background=followed_points(path, joints, FPS, 0))
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +80,33 @@ def test_two_still_cameras_give_one_body_that_is_better_than_either(
     there = np.flatnonzero(both.stamp_ns * 1e-9 >= view["offset_s"])[: len(right.stamp_ns)]
     np.testing.assert_array_equal(right.joints3d, both.joints3d[there])
     assert float(np.nanmedian(right.reprojection_px)) < 5.0
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_flying_camera_without_telemetry_makes_the_body_better_than_either_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], background: bool
+) -> None:
+    time_s = np.arange(FRAMES) / FPS
+    left = seen_from(0.0, time_s, speed_deg_s=10.0, background=background)
+    right = seen_from(100.0, time_s[:-40] + LATER_S, speed_deg_s=-20.0)
+    save_tracks(tmp_path / "left.npz", left)
+    save_tracks(tmp_path / "right.npz", replace(right, stamp_ns=right.stamp_ns + _CLOCK_NS))
+    inputs = [str(tmp_path / name) for name in ("left.npz", "right.npz")]
+    assert main(["reconstruct", *inputs, "--together", "--out", str(tmp_path / "both"), "--no-report"]) == 0
+    said = capsys.readouterr().out
+    assert "its camera moves as the body turns in its pictures" in said
+    for name in ("left", "right"):
+        one = ["reconstruct", str(tmp_path / f"{name}.npz"), "--out", str(tmp_path / name), "--no-report", "--quiet"]
+        assert main(one) == 0
+    both, one, other = (load_motion(tmp_path / name) for name in ("both", "left", "right"))
+    joints = truth(time_s)
+    error, alone = (pa_mpjpe(motion.joints3d[:, :15], joints[:, :15]).mean() for motion in (both, one))
+    assert error < 0.8 * alone
+    assert error < 0.8 * pa_mpjpe(other.joints3d[:, :15], truth(time_s[:-40] + LATER_S)[:, :15]).mean()
+    assert both.meta["together"]["views"][1]["offset_s"] == pytest.approx(LATER_S, abs=0.02)
+    # Without fixed points nothing tells how the first camera moves: there is no world, and the command says so.
+    assert both.frame == ("world" if background else "camera")
+    assert ("a path through a world is not known" in said) == (not background)
 
 
 def test_a_recording_of_another_motion_is_refused_by_its_name(

@@ -1,19 +1,23 @@
 """Several recordings of one person to one motion: times, places, then one body adjusted to all views.
 
 Times and places come from the body as every recording alone gives it; the adjustment then measures both again.  A
-camera is known by its own telemetry or picture up to the place of its world; one without either is taken to stand.
+camera is known by its own telemetry or picture up to the place of its world; one without either stands, or moves as the
+body turns in its pictures.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.ellipsoids import pack_covariance, unpack_covariance
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.reconstruct import SolvedView
-from drocap_ros.reconstruction.together.placement import Placement, place_view
+from drocap_ros.reconstruction.together.placement import Placement, follow_view, place_view
 from drocap_ros.reconstruction.together.problem import JoinedProblem
 from drocap_ros.reconstruction.together.timing import TimeOffset, time_offsets
 from drocap_ros.reconstruction.together.view import View
@@ -43,41 +47,45 @@ def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> 
         When two recordings do not show the same motion at any time.
     """
     views = [View.of(one, name) for one, name in zip(solved, names, strict=True)]
-    first = views[0]
-    offsets, placed = [0.0], [_SAME_WORLD]
-    for name, view in zip(names[1:], views[1:], strict=True):
-        offset, placement = _best_fit(first, view, name, names[0])
-        offsets.append(offset.seconds)
-        placed.append(placement)
     home = _home(views)
-    moved = _in_world_of(home, views, placed)
-    problem = JoinedProblem(moved, home, offsets)
+    fits = [_best_fit(views[home], view, name, names[home]) for view, name in zip(views, names, strict=True)]
+    offsets = [offset.seconds - fits[0][0].seconds for offset, _ in fits]
+    moved = [view.moved(p.scale, p.rotation, p.translation) for view, (_, p) in zip(views, fits, strict=True)]
+    at_rest = views[home].own_world or not any(p.moves for _, p in fits)
+    problem = JoinedProblem(moved, home, offsets, at_rest)
     with blas_threads(threads):
         refined = problem.with_home_errors(problem.solve())
         return _results(problem, refined, names)
 
 
-def _best_fit(first: View, view: View, name: str, to: str) -> tuple[TimeOffset, Placement]:
-    """Offset and place of a view: of the times at which the motions are alike, that at which the bodies fit best."""
-    found = time_offsets(first.shown(), view.shown())
+def _best_fit(home: View, view: View, name: str, to: str) -> tuple[TimeOffset, Placement]:
+    """Offset and place of a view: of the times at which the motions are alike, that at which the bodies fit best.
+
+    A camera without a world stands, unless it moves at each of these times.
+    """
+    if view is home:
+        return TimeOffset(0.0, 1.0), _SAME_WORLD
+    found = time_offsets(home.shown(), view.shown())
     if not found or found[0].likeness < _LEAST_LIKENESS:
         alike = f"a likeness of {found[0].likeness:.2f}" if found else "too short a time"
         raise InputError(
             f"{name}: expected the motion that {to} shows, for at least 2 s, found {alike} at the best time; are both"
             " of the same person at the same time?"
         )
-    if first.reported and view.reported and (agreed := _agreed(first, view, found)):
+    if home.reported and view.reported and (agreed := _agreed(home, view, found)):
         return agreed, _SAME_WORLD
     good = [offset for offset in found if offset.likeness > 0.8 * found[0].likeness]
-    upright = first.own_world and view.own_world
-    fits = [(offset, place_view(first, view, offset.seconds, upright)) for offset in good]
+    fits = [(offset, place_view(home, view, offset.seconds, upright=view.own_world)) for offset in good]
+    if not view.own_world:
+        followed = [(offset, follow_view(home, view, offset.seconds)) for offset in good]
+        fits = followed if all(placement.moves for _, placement in followed) else fits
     return min(fits, key=lambda fit: fit[1].residual_m / fit[0].likeness)
 
 
-def _agreed(first: View, view: View, found: list[TimeOffset]) -> TimeOffset | None:
+def _agreed(home: View, view: View, found: list[TimeOffset]) -> TimeOffset | None:
     """The offset under which two reported worlds are the same one; None = they have different origins."""
     for offset in found:
-        placed = place_view(first, view, offset.seconds, upright=True)
+        placed = place_view(home, view, offset.seconds, upright=True)
         turn = np.degrees(np.arctan2(placed.rotation[1, 0], placed.rotation[0, 0]))
         person = np.median(view.joints[:, 0], axis=0)
         apart = np.linalg.norm(placed.scale * placed.rotation @ person + placed.translation - person)
@@ -93,14 +101,6 @@ def _home(views: list[View]) -> int:
         return view.solved.motion.metric, view.own_world and not view.stands, view.own_world
 
     return max(range(len(views)), key=lambda n: (*rank(views[n]), -n))
-
-
-def _in_world_of(home: int, views: list[View], placed: list[Placement]) -> list[View]:
-    """The views in the world of one of them, from their placements in the first one's."""
-    there = placed[home]
-    back = there.rotation.T
-    in_first = [view.moved(p.scale, p.rotation, p.translation) for view, p in zip(views, placed, strict=True)]
-    return [view.moved(1.0 / there.scale, back, -back @ there.translation / there.scale) for view in in_first]
 
 
 def _results(problem: JoinedProblem, refined: RefinedWorld, names: list[str]) -> list[Motion]:
@@ -133,5 +133,20 @@ def _results(problem: JoinedProblem, refined: RefinedWorld, names: list[str]) ->
             camera_position=position / scale,
             covariance=refined.covariance[rows] / scale**2,
         )
-        out.append(motion)
+        out.append(motion if problem.at_rest else _in_camera(motion))
     return out
+
+
+def _in_camera(motion: Motion) -> Motion:
+    """The motion in the axes of each image's camera, about the pelvis: what moves in no world that is at rest."""
+    assert motion.covariance is not None
+    turn = motion.camera_rotation
+    there = unpack_covariance(motion.covariance)
+    return replace(
+        motion,
+        joints3d=(motion.joints3d - motion.joints3d[:, :1]) @ np.swapaxes(turn, 1, 2),
+        frame="camera",
+        camera_rotation=np.broadcast_to(np.eye(3), turn.shape).copy(),
+        camera_position=None,
+        covariance=pack_covariance(turn[:, None] @ there @ np.swapaxes(turn, 1, 2)[:, None]),
+    )

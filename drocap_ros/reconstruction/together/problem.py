@@ -35,10 +35,14 @@ _SINGLE_M = 0.3
 
 
 class JoinedProblem:
-    """The views at the times and places known so far."""
+    """The views at the times and places known so far.
 
-    def __init__(self, views: list[View], home: int, offsets: list[float]) -> None:
-        self.views, self.home, self.offsets = views, home, offsets
+    at_rest : whether the common world is; else it is that of a camera that moves, and feet rest nowhere in it
+    """
+
+    def __init__(self, views: list[View], home: int, offsets: list[float], at_rest: bool) -> None:
+        self.views = views if at_rest else [replace(v, config=replace(v.config, feet=False)) for v in views]
+        self.home, self.offsets, self.at_rest = home, offsets, at_rest
         self.offset_std = [0.0] * len(views)
         slot, _ = even_slots(views[0].solved.tracks.stamp_ns)
         self._slot = slot
@@ -172,8 +176,11 @@ class JoinedProblem:
         """Metres of the body at its assumed stature per metre of the world."""
         return float(np.median([float(str(window["scale"])) for window in refined.calibration]))
 
-    def told(self, number: int, view: WorldInput, refined: RefinedWorld) -> dict[str, float]:
-        """JSON-compatible: time and place of a view, and how far its keypoints lie from the common body."""
+    def told(self, number: int, view: WorldInput, refined: RefinedWorld) -> dict[str, float | bool]:
+        """JSON-compatible: time and place of a view, and how far its keypoints lie from the common body.
+
+        by_body : whether the camera moves and nothing but the body in its pictures tells how
+        """
         keypoints, _ = self.shown(number, view)
         off = reprojection_px(refined.joints, *self.camera(number, view, refined), view.camera_matrix, keypoints)
         alone = self.views[number].solved.motion.reprojection_px[:, :17]
@@ -184,6 +191,7 @@ class JoinedProblem:
             "median_px": float(np.nanmedian(off)),
             "median_px_alone": float(np.nanmedian(alone)),
             "placed_m": doubt.placed_m,
+            "by_body": not (self.views[number].own_world or self.views[number].stands),
         }
 
     def _late(self, view: WorldInput, number: int, refined: RefinedWorld) -> tuple[float, float]:

@@ -25,6 +25,8 @@ _GAP_S = 0.1
 _STANDS_M = 0.05
 #: Errors of a camera on a tripod: of its attitude none but that of its placement.
 _STANDING = WorldConfig(latency_std_s=1e-3, position_wander_m=0.002, attitude_wander_deg=0.01, checks=False)
+#: Errors of a path that two bodies give: their turns err by 4 degrees for a second, their ranges by a tenth.
+_FOLLOWED = WorldConfig(latency_std_s=1e-3, position_wander_m=0.5, attitude_wander_deg=8.0, checks=False)
 
 
 class Doubt(NamedTuple):
@@ -44,7 +46,7 @@ class View:
 
     solved : of the recording alone
     joints : (F, 17, 3) m; turn : (F, 3, 3) world -> camera; path : (F, 3) m
-    own_world : whether the recording has a world, by telemetry or by its picture; else its camera is taken to stand
+    own_world : whether the recording has a world, by telemetry or by its picture; else that of its camera
     reported : whether the world is that of telemetry: east, north and up
     config : errors of the camera there
     """
@@ -117,12 +119,14 @@ class View:
         return bool(np.ptp(self.path, axis=0).max() < _STANDS_M)
 
     def moved(self, scale: float, rotation: np.ndarray, translation: np.ndarray) -> View:
-        """The view in another world: ``place there = scale * rotation @ place + translation``."""
+        """The view in another world: ``place there = scale * rotation @ place + translation``, by image or for all."""
+        back = np.swapaxes(rotation, -1, -2)
         return replace(
             self,
-            joints=scale * self.joints @ rotation.T + translation,
-            path=scale * self.path @ rotation.T + translation,
-            turn=self.turn @ rotation.T,
+            joints=scale * self.joints @ back + translation[..., None, :],
+            path=scale * (self.path[:, None] @ back)[:, 0] + translation,
+            turn=self.turn @ back,
+            config=_FOLLOWED if rotation.ndim > 2 else self.config,
         )
 
     def placed_poses(self, joints: np.ndarray) -> PlacedPoses:
