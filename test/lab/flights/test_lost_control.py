@@ -8,6 +8,7 @@ from branched import branched
 from pymavlink.dialects.v20.ardupilotmega import MAV_STATE_CRITICAL as CRITICAL
 
 from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.mavlink.guardian import has_left
 from drocap_ros.flight.orbit.states import Action, Command, State
 from lab.flights.fault_injections import pilot
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop
@@ -68,6 +69,25 @@ def test_a_control_loop_that_hangs_leaves_the_pilots_mode_to_him(loop):
     assert max(sent) < 8.1  # until the report has come
     assert loop.copter.mode == "LOITER"
     assert loop.controller.safety.state != State.ORBITING
+
+
+@BOTH
+@branched
+def test_the_guardian_of_a_dead_bridge_would_see_the_pilots_mode_in_what_the_vehicle_sends(loop):
+    heard, controls, write = [], [], loop.down.write
+
+    def listen(data):
+        heard.append((loop.t, bytes(data)))
+        write(data)
+
+    loop.down.write, loop.link.guardian = listen, lambda packets, control, _: controls.append(control)
+    loop.run(8.0)
+    control, other = controls[-1], (*controls[-1][:2], 77)
+    assert not any(has_left(data, control) for _, data in heard)
+    assert any(has_left(data, other) for _, data in heard)
+    pilot("LOITER")(loop)
+    loop.run(9.0)
+    assert min(t for t, data in heard if has_left(data, control)) < 8.4  # two of its packets
 
 
 @BOTH
