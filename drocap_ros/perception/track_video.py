@@ -18,10 +18,6 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.sources.base import Frame, prefetch, with_next
 from drocap_ros.tracks import Tracks
 
-#: Errors (m) in depth behind the hips of BlazePose's joints in space, on three phone videos with optical MoCap: arms
-#: err by more than their errors across the image tell.
-_SPACE_ERRORS_M = {"shoulder": 0.12, "elbow": 0.11, "wrist": 0.13, "knee": 0.07, "ankle": 0.08}
-
 
 def observe(
     frames: Iterable[Frame],
@@ -118,7 +114,6 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
     rois = np.array([o.roi for o in observations], float)
     box_size = np.nan_to_num((rois[:, 2:] - rois[:, :2]).max(axis=1))
     corrected = with_own_legs(Keypoints2D(keypoints, confidence, covariance), stamp_ns, box_size)
-    evidence, errors = _evidence(observations, mine, joints.joints, rois)
     return Tracks(
         keypoints=corrected.xy,
         joints=joints.joints,
@@ -128,25 +123,26 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
         covariance=corrected.covariance,
         real_lens=True,
         background=of_images(o.background for o in observations),
-        evidence=evidence,
-        evidence_sigma=errors,
+        evidence=_evidence(observations, mine, len(joints), rois),
     )
 
 
 def _evidence(
-    observations: Sequence[PoseObservation], mine: np.ndarray, joints: tuple[str, ...], rois: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
-    """(F, P, 3) m, joints in space in the cameras' axes, of a lens as it is assumed, and (F, P) their errors, or None.
+    observations: Sequence[PoseObservation], mine: np.ndarray, joints: int, rois: np.ndarray
+) -> np.ndarray | None:
+    """(F, joints, 3) m, joints in space in the cameras' axes, of a lens as it is assumed; None = there are none.
+
+    Their errors are not told: those across the image, which the adjustment measures, stand beside the lifter's, which
+    are too small for real people by as much.
 
     mine : (F,) bool, the images of the subject; rois : (F, 4) px, its boxes
     """
     if not any(observations[i].space is not None for i in np.nonzero(mine)[0]):
-        return None, None
-    space = np.full((len(observations), len(joints), 3), np.nan)
+        return None
+    space = np.full((len(observations), joints, 3), np.nan)
     for i in np.nonzero(mine)[0]:
         if (seen := observations[i].space) is not None:
             space[i] = seen
     camera = assumed_camera(observations[0].image_size)
     ray = (0.5 * (rois[:, :2] + rois[:, 2:]) - camera[:2, 2]) / np.diagonal(camera)[:2]
-    errors = [_SPACE_ERRORS_M.get(joint[1:], np.nan) for joint in joints]
-    return np.asarray(space @ towards(np.nan_to_num(ray))), np.tile(errors, (len(space), 1))
+    return np.asarray(space @ towards(np.nan_to_num(ray)))
