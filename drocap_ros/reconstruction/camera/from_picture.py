@@ -34,6 +34,10 @@ _LASTING_FOCAL_STD = 0.01
 _FOCAL_STARTS = (0.7, 1.0, 1.5)
 #: Keyframes after which the starts are compared, and residuals over the least that are as good.
 _COMPARED = 16
+#: Share of points behind the camera from which a path counts as turned inside out: such ones had 5 to 54 %, others 0.
+_BEHIND = 0.03
+#: Points of a keyframe by which a path grows, where there are more: the last adjustment has all.
+_ENOUGH = 80
 _AS_GOOD = 1.05
 #: The same of a whole path over those few keyframes: more points and times fit a little worse in any case.
 _WORSE = 1.5
@@ -110,7 +114,10 @@ def camera_from_points(
 
 def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> PictureCamera:
     """The path of a camera that moves: grown from a pair, or all at once where it moves little."""
-    starts = _starts(sightings, camera, key_hz)
+    starts = _right(_starts(sightings.thinned(_ENOUGH), camera, key_hz))
+    if not starts:
+        every = _starts(sightings, camera, key_hz)
+        starts = _right(every) or every
     if not starts:
         return replace(camera, kind=Kind.NOTHING_FIXED)
     least = min(start.path.residual_px for _, start in starts)
@@ -165,6 +172,11 @@ def _starts(sightings: Sightings, camera: PictureCamera, key_hz: float) -> list[
                 growths.append((pair, growth))
     growths.sort(key=lambda entry: -entry[0].score)
     return [(pair.parallax, growth) for pair, growth in growths if growth.path.known.sum() >= enough]
+
+
+def _right(starts: list[tuple[float, Growth]]) -> list[tuple[float, Growth]]:
+    """Those that are not turned inside out: rays through a wrong lens can meet behind the camera as well."""
+    return [(parallax, growth) for parallax, growth in starts if growth.behind < _BEHIND]
 
 
 def _turning(sightings: Sightings, camera: PictureCamera, fps: float) -> PictureCamera:

@@ -165,6 +165,8 @@ class Growth:
         pieces = len(self.sightings.views.track)
         self._square, self._count = np.zeros((pieces, 4, 4)), np.zeros(pieces, int)
         self.places, self.usable = np.zeros((pieces, 3)), np.zeros(pieces, bool)
+        #: Those of the usable ones that are behind the camera that sees them.
+        self._behind = np.zeros(pieces, bool)
         #: Where each point was last seen from, the direction there, and the first one.
         self._eye, self._ray, self._first = np.zeros((3, pieces, 3))
         for key in np.flatnonzero(self.path.known).tolist():
@@ -195,7 +197,14 @@ class Growth:
         agree = value[:, 0] < self._count[piece] * np.maximum(noise * np.square(way), 1e-30) * 100.0
         near = np.linalg.norm(self.places[piece], axis=1) < _FARTHEST * way
         deep = value[:, 1] > 30.0 * np.maximum(value[:, 0], 1e-30)
-        self.usable[piece] = (self._count[piece] >= 2) & agree & near & deep
+        sure = (self._count[piece] >= 2) & agree & near & deep
+        before = np.einsum("ni,ni->n", self.places[piece] - self._eye[piece], self._ray[piece]) > 0.0
+        self.usable[piece], self._behind[piece] = sure, sure & ~before
+
+    @property
+    def behind(self) -> float:
+        """Share of the points that are behind the camera, as in a path that is turned inside out."""
+        return float(self._behind.sum() / max(int(self.usable.sum()), 1))
 
     def adjust(self) -> None:
         """Adjust what is known, at the keyframes alone, and take it over."""

@@ -113,8 +113,11 @@ class PathEquations:
         key = views.piece * self._reach + relative
         starts = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
         piece, at = views.piece[starts], relative[starts]
-        later = np.add.reduceat(knots.share[views.frame][:, None, None] * both[..., :KNOT], starts, axis=0)
-        coupling[piece, :, at] += np.add.reduceat(both[..., :KNOT], starts, axis=0) - later
+        knot = both[..., :KNOT]
+        later = knots.share[views.frame][:, None, None] * knot
+        if len(starts) < len(key):
+            knot, later = (np.add.reduceat(of_views, starts, axis=0) for of_views in (knot, later))
+        coupling[piece, :, at] += knot - later
         coupling[piece, :, at + 1] += later
         self._inverse = inverse
         self._knots = inverse @ coupling.reshape(len(views.track), 3, -1)

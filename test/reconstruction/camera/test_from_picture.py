@@ -9,6 +9,8 @@ from fixed_points import MATRIX, SIZE, Scene, looking, orbit, points_of, seen, s
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
 from drocap_ros.reconstruction.camera.kinds import Kind
+from drocap_ros.reconstruction.camera.sightings import Sightings
+from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.threads import blas_threads
 
 FPS = 12.0
@@ -43,6 +45,32 @@ def test_path_and_lens_are_found_together() -> None:
     assert found.matrix[0, 0] == pytest.approx(MATRIX[0, 0], rel=0.02)
     assert abs(np.log(found.matrix[0, 0] / MATRIX[0, 0])) < 4.0 * found.focal_std
     assert shape_error(found.position, scene.position) < 0.1
+
+
+def test_start_that_a_wrong_lens_turns_inside_out_is_not_followed() -> None:
+    rng, frames, count = np.random.default_rng(12), 96, 700
+    bearing = 2 * np.pi * rng.random() + np.deg2rad(19.0) * np.arange(frames) / FPS
+    position = np.stack([6.0 * np.cos(bearing), 6.0 * np.sin(bearing), np.full(frames, 2.5)], axis=1)
+    away, angle = 60.0 * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    height = np.where(rng.random(count) < 0.3, rng.uniform(0.0, 6.0, count), 0.0)
+    points = np.stack([away * np.cos(angle), away * np.sin(angle), height], axis=1)
+    scene = seen(looking(position, np.tile([0.0, 0.0, 0.95], (frames, 1))), position, points, FPS)
+    found = camera_of(scene._replace(point=scene.point + 0.4 * rng.standard_normal(scene.point.shape)), None)
+    assert found.kind is Kind.MOVES
+    assert found.matrix[0, 0] == pytest.approx(MATRIX[0, 0], rel=0.02)
+    assert shape_error(found.position, scene.position) < 0.05
+
+
+def test_thinned_sightings_have_enough_points_at_every_keyframe() -> None:
+    scene = orbiting()
+    few = np.where(scene.frame < 24, scene.track % 5 == 0, True)  # a beginning of little texture
+    views = views_of(scene.frame[few], scene.track[few], scene.point[few], FRAMES, FPS)
+    every = Sightings(views, np.arange(0, FRAMES, 3))
+    thinned = every.thinned(30)
+    before, after = ([len(at.at(key)[0]) for key in range(len(every))] for at in (every, thinned))
+    assert min(before) < 30 < max(before)
+    assert all(min(30, count) <= left <= count for count, left in zip(before, after, strict=True))
+    assert sum(after) < 0.6 * sum(before)
 
 
 def test_camera_that_follows_slowly_is_found_without_parallax_to_begin_with() -> None:
