@@ -60,6 +60,16 @@ def as_drawn(body: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         hip, knee, ankle = (body[:, :, _J[side + part]] for part in ("hip", "knee", "ankle"))
         lower = np.clip(low + 0.04 * _normal(rng, windows), -0.05, 0.35).astype(np.float32) * biased
         drawn[:, :, _J[side + "hip"]] += lower * (knee - hip)
+        # Networks draw a bent knee on the kneecap, up the shank: on three people with optical MoCap by 30 to 52 mm of a
+        # right angle on each of six legs.
+        thigh, shank = knee - hip, ankle - knee
+        cosine = (thigh * shank).sum(-1) / np.maximum(
+            np.linalg.norm(thigh, axis=-1) * np.linalg.norm(shank, axis=-1), 1e-6
+        )
+        bent = np.sqrt(np.clip(1.0 - cosine, 0.0, 2.0))[..., None].astype(np.float32)
+        drawn[:, :, _J[side + "knee"]] -= (
+            rng.uniform(0.0, 0.14, (windows, 1, 1)).astype(np.float32) * bent * biased * shank
+        )
         for joint in ("knee", "ankle"):
             along = 0.04 * _normal(rng, windows) + 0.025 * slow(rng, windows, frames, (1,))
             drawn[:, :, _J[side + joint]] += along * biased * (ankle - knee)

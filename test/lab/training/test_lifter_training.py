@@ -10,7 +10,7 @@ import pytest
 from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, PARTS
 from drocap_ros.skeleton import BODY_17, indices
-from lab.training.keypoint_errors import detect
+from lab.training.keypoint_errors import as_drawn, detect
 from lab.training.leg_lengths import refit_knees
 from lab.training.lifter_samples import camera_rotation, sample_batch
 from lab.training.mocap_bank import MocapBank, load_bank, straighten_legs
@@ -259,3 +259,16 @@ def test_muon_steps_along_an_orthogonal_matrix():
 
 def weights(network) -> list[np.ndarray]:
     return [weight.detach().numpy() for weight in network.parameters()]
+
+
+def test_a_bent_knee_is_drawn_up_the_shank_and_a_straight_one_on_its_line():
+    at = BODY_17.index
+    body = np.zeros((400, 4, 17, 3), np.float32)
+    body[:, :, [at("rknee"), at("lknee")]] = (0, 0.4, 0)
+    body[:, :, at("rankle")] = (0, 0.8, 0)
+    body[:, :, at("lankle")] = (0, 0.4, 0.4)  # a right angle
+    drawn = as_drawn(body, np.random.default_rng(0)) - body
+    along = {"r": drawn[:, :, at("rknee"), 1], "l": drawn[:, :, at("lknee"), 2]}
+    assert abs(along["r"].mean()) < 0.003
+    assert -0.020 < along["l"].mean() < -0.008  # half of the windows, 0 to 56 mm
+    np.testing.assert_allclose(drawn[:, :, [at("rknee"), at("lknee")], 0], 0, atol=1e-6)
