@@ -36,8 +36,6 @@ _FOCAL_STARTS = (0.7, 1.0, 1.5)
 _COMPARED = 16
 #: Share of points behind the camera from which a path counts as turned inside out: such ones had 5 to 54 %, others 0.
 _BEHIND = 0.03
-#: Points of a keyframe by which a path grows, where there are more: the last adjustment has all.
-_ENOUGH = 80
 _AS_GOOD = 1.05
 #: The same of a whole path over those few keyframes: more points and times fit a little worse in any case.
 _WORSE = 1.5
@@ -114,10 +112,8 @@ def camera_from_points(
 
 def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> PictureCamera:
     """The path of a camera that moves: grown from a pair, or all at once where it moves little."""
-    starts = _right(_starts(sightings.thinned(_ENOUGH), camera, key_hz))
-    if not starts:
-        every = _starts(sightings, camera, key_hz)
-        starts = _right(every) or every
+    every = _starts(sightings, camera, key_hz)
+    starts = _right(every) or every
     if not starts:
         return replace(camera, kind=Kind.NOTHING_FIXED)
     least = min(start.path.residual_px for _, start in starts)

@@ -41,15 +41,6 @@ class Sightings:
         views, _ = self.views.at_frames(key >= 0)
         return replace(views, frame=key[views.frame], frames=len(self))
 
-    def thinned(self, enough: int) -> Sightings:
-        """Sightings of fewer pieces, drawn evenly, of which every keyframe sees ``enough``, or all that it sees."""
-        drawn = np.random.default_rng(0).permutation(len(self.views.track))
-        kept = np.zeros(len(drawn), bool)
-        for rows in self.rows:
-            pieces = self.views.piece[rows]
-            kept[pieces[np.argsort(drawn[pieces])[:enough]]] = True
-        return Sightings(self.views.of(kept), self.frames)
-
     def __len__(self) -> int:
         return len(self.frames)
 

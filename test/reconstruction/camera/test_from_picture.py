@@ -9,8 +9,6 @@ from fixed_points import MATRIX, SIZE, Scene, looking, orbit, points_of, seen, s
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
 from drocap_ros.reconstruction.camera.kinds import Kind
-from drocap_ros.reconstruction.camera.sightings import Sightings
-from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.threads import blas_threads
 
 FPS = 12.0
@@ -59,18 +57,6 @@ def test_start_that_a_wrong_lens_turns_inside_out_is_not_followed() -> None:
     assert found.kind is Kind.MOVES
     assert found.matrix[0, 0] == pytest.approx(MATRIX[0, 0], rel=0.02)
     assert shape_error(found.position, scene.position) < 0.05
-
-
-def test_thinned_sightings_have_enough_points_at_every_keyframe() -> None:
-    scene = orbiting()
-    few = np.where(scene.frame < 24, scene.track % 5 == 0, True)  # a beginning of little texture
-    views = views_of(scene.frame[few], scene.track[few], scene.point[few], FRAMES, FPS)
-    every = Sightings(views, np.arange(0, FRAMES, 3))
-    thinned = every.thinned(30)
-    before, after = ([len(at.at(key)[0]) for key in range(len(every))] for at in (every, thinned))
-    assert min(before) < 30 < max(before)
-    assert all(min(30, count) <= left <= count for count, left in zip(before, after, strict=True))
-    assert sum(after) < 0.6 * sum(before)
 
 
 def test_camera_that_follows_slowly_is_found_without_parallax_to_begin_with() -> None:
