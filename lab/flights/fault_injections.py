@@ -315,6 +315,11 @@ def in_wind(settings: LoopSettings) -> LoopSettings:
     return dataclasses.replace(settings, wind_m_s=(8.0, 0.0, 0.0))
 
 
+def near_fence(bearing_deg: float) -> Callable[[LoopSettings], LoopSettings]:
+    """The fence lies 3 m outside of the orbit, which begins at a bearing from the person."""
+    return lambda settings: dataclasses.replace(with_config(settings, fence_radius_m=9.0), bearing_deg=bearing_deg)
+
+
 def late_stamps(settings: LoopSettings) -> LoopSettings:
     """Pictures are stamped 100 ms after their exposure."""
     return dataclasses.replace(settings, stamp_late_s=0.1)

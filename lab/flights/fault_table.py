@@ -48,6 +48,7 @@ from lab.flights.fault_injections import (
     longer,
     lose_half,
     move_stick,
+    near_fence,
     no_orbit,
     old_commands,
     orbits_again,
@@ -71,7 +72,6 @@ from lab.flights.fault_injections import (
     walk_to_vehicle,
     wrong_ground,
 )
-from lab.flights.orbit_loop import with_config
 from lab.flights.report_injections import (
     CRITICAL,
     ECHO,
@@ -267,9 +267,11 @@ _OPERATOR = (
 )
 _SUBJECT = (
     Fault("subject walks towards the vehicle", walk_to_vehicle, harmless=True),
-    Fault(
-        "subject leaves the fence", walk_east, harmless=True, codes=(_C.AT_FENCE,), check=inside_fence, watch_s=14.0,
-        change=lambda settings: with_config(settings, fence_radius_m=9.0),
+    *(
+        Fault(
+            name, walk_east, harmless=True, codes=(_C.AT_FENCE,), check=inside_fence, watch_s=14.0,
+            change=near_fence(bearing_deg),
+        ) for name, bearing_deg in (("subject leaves the fence", 0.0), ("subject drives it out", 180.0))
     ),
 )  # fmt: skip
 

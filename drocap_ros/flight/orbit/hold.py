@@ -10,7 +10,7 @@ import numpy as np
 from drocap_ros.flight.conditions import PICTURE_CODES, Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
-from drocap_ros.flight.orbit.motion_checks import braking_distance, subject_located
+from drocap_ros.flight.orbit.motion_checks import subject_located
 from drocap_ros.flight.orbit.sight import UNSEEN_S
 from drocap_ros.flight.orbit.states import Limits, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig
@@ -32,13 +32,21 @@ _HARMLESS = PICTURE_CODES | {ConditionCode.ATTITUDE_OUTDATED, ConditionCode.POSI
 
 
 def begin_hold(
-    state: SafetyState, reason: Condition, seen: Observed, now_s: float, blind: bool, retreats: bool = False
+    state: SafetyState,
+    reason: Condition,
+    seen: Observed,
+    now_s: float,
+    fence_radius_m: float,
+    *,
+    blind: bool,
+    retreats: bool = False,
 ) -> SafetyState:
     """Enter HOLDING at the present position.
 
     A position that was known a moment ago is extrapolated by the last velocity and held: a position setpoint stops the
     vehicle sooner than velocity zero.
 
+    fence_radius_m : no way out leads beyond it
     blind : whether the vehicle's state is not to be trusted
     retreats : see :class:`SafetyState`
     """
@@ -49,7 +57,7 @@ def begin_hold(
     place = None
     if known:
         stood = state.pace.value == 0.0 and reason.code in _HARMLESS
-        place = state.pace.place if stood else _stopping_place(seen, fresh)
+        place = state.pace.place if stood else _stopping_place(seen, fresh, state.fence_centre, fence_radius_m)
     return dataclasses.replace(
         state,
         state=State.HOLDING,
@@ -73,12 +81,29 @@ def located(seen: Observed) -> bool:
     return seen.vehicle.known and seen.health.located and not seen.jumped
 
 
-def _stopping_place(seen: Observed, fresh: bool) -> np.ndarray:
+def _stopping_place(seen: Observed, fresh: bool, fence: np.ndarray | None, radius_m: float) -> np.ndarray:
     """(3,) m, where a vehicle is to stop whose position is as old as reported."""
     vehicle = seen.vehicle
     behind_s = 0.0 if fresh else max(vehicle.position_age_s - vehicle.age_s, 0.0)
-    place: np.ndarray = vehicle.position + vehicle.velocity * behind_s + _way_out(seen)
-    return place
+    here: np.ndarray = vehicle.position + vehicle.velocity * behind_s
+    return here + _share_inside(here, way := _way_out(seen), fence, radius_m) * way
+
+
+def _share_inside(here: np.ndarray, way: np.ndarray, fence: np.ndarray | None, radius_m: float) -> float:
+    """Share of a way (3,) m from a place (3,) m until it leaves the fence; 0 for one that leads on outside of it.
+
+    fence : (2,) m, its centre; None = there is none
+    """
+    if fence is None:
+        return 1.0
+    offset, step = (here[:2] - fence), way[:2]
+    if np.hypot(*(offset + step)) <= radius_m:
+        return 1.0
+    room = radius_m**2 - float(offset @ offset)
+    if room <= 0.0:
+        return 0.0
+    along, length = float(offset @ step), float(step @ step)
+    return (math.sqrt(along**2 + length * room) - along) / length
 
 
 def _way_out(seen: Observed) -> np.ndarray:
@@ -131,7 +156,7 @@ def resumption(
 
 
 def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
-    """Move the hold position away from an approaching subject, at most to the fence.
+    """Move the hold position away from an approaching subject, at most to the fence, and never nearer to the subject.
 
     Only a subject that is located counts, and only until the autopilot's hold mode has been requested.
     """
@@ -142,12 +167,10 @@ def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) ->
     if not seen.subject.distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
         return state
     outward = (seen.vehicle.position - subject)[:2] / max(seen.subject.distance_m, 1e-3)
-    target = subject[:2] + wanted * outward
-    step = target - seen.vehicle.position[:2]
-    target = seen.vehicle.position[:2] + step * min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
-    offset = target - fence
-    room = safety.fence_radius_m - braking_distance(limits.orbit.max_speed_m_s, safety)
-    target = fence + offset * min(1.0, room / max(float(np.hypot(*offset)), 1e-6))
+    here = seen.vehicle.position
+    step = subject[:2] + wanted * outward - here[:2]
+    step *= min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
+    target = here[:2] + _share_inside(here, step, fence, safety.fence_radius_m) * step
     return dataclasses.replace(state, hold_position=np.append(target, place[2]), retreated_s=now_s)
 
 

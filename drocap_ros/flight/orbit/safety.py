@@ -103,7 +103,8 @@ def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits
     """Slow the orbit down by the age of the data, or end it."""
     problem = _ending(state, seen, limits) or keeping_condition(seen, limits)
     if problem:
-        return begin_hold(state, problem, seen, now_s, blind, retreats=problem.code == _C.SUBJECT_NEAR)
+        near = problem.code == _C.SUBJECT_NEAR
+        return begin_hold(state, problem, seen, now_s, limits.safety.fence_radius_m, blind=blind, retreats=near)
     allowed, cause = allowed_pace(seen, limits)
     pace = next_pace(state.pace, allowed, now_s, seen.vehicle.position, contradicted=seen.subject.contradicted)
     reason = state.condition
@@ -224,7 +225,7 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
     if state.state == State.ORBITING or (state.state == State.HOLDING and state.retreats):
         answer = _accepted(_C.STOPPED)
         blind = vehicle_condition(seen, limits) is not None
-        return begin_hold(state, answer.condition, seen, now_s, blind), answer
+        return begin_hold(state, answer.condition, seen, now_s, limits.safety.fence_radius_m, blind=blind), answer
     if state.state in (State.TAKEN_OVER, State.FAULT):
         answer = _accepted(_C.ACKNOWLEDGED)
         return _enter(State.IDLE, answer.condition, now_s), answer

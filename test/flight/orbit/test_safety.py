@@ -324,6 +324,37 @@ def test_vehicle_that_moves_away_fast_is_held_where_it_can_stop():
     assert begun[1].hold_position[0] == pytest.approx(9.5)
 
 
+@pytest.mark.parametrize("north_m", np.arange(0.0, 40.0, 5.0))
+@pytest.mark.parametrize("east_m", [10.0, 30.0, 33.0, 35.0, 37.0, 39.5, 40.5])
+def test_a_retreat_ends_at_the_fence_and_never_leads_to_the_subject(east_m, north_m):
+    """It once led back to 8 m inside the fence, through the person."""
+    here, state = np.array([east_m, north_m, 2.5]), orbiting()
+    for step, distance in enumerate((2.9, 2.8, 2.7, 2.6)):
+        away = np.array([distance, 0.0, 1.6])
+        seen = changed(
+            GOOD, position=here, subject=here - away, subject_distance_m=distance, approach_m_s=0.5, link_age_s=0.02
+        )
+        state, decision = reduce(state, seen, 10.0 + 0.05 * step, None, LIMITS)
+        assert decision.action == Action.HOLD
+        hold = state.hold_position
+        assert hold[0] >= east_m
+        assert hold[1] == pytest.approx(north_m)
+        centre_m, own_m = np.linalg.norm(hold[:2]), np.linalg.norm(here[:2])
+        assert centre_m <= max(LIMITS.safety.fence_radius_m, own_m) + 1e-6
+    assert state.hold_position[0] > east_m or own_m > 39.0  # it does retreat
+
+
+@pytest.mark.parametrize(("east_m", "held_m"), [(30.0, 31.5), (38.8, 40.0), (40.2, 40.2)])
+def test_a_hold_on_the_way_out_ends_at_the_fence(east_m, held_m):
+    seen = changed(
+        GOOD, position=np.array([east_m, 0, 2.5]), velocity=np.array([1.4, 0, 0]), closing_m_s=-1.4,
+        subject=np.array([east_m - 4.5, 0, 0.9]), subject_distance_m=4.5,
+    )  # fmt: skip
+    state, _ = reduce(orbiting(), seen, 10.0, Command.STOP, LIMITS)
+    assert state.state == State.HOLDING
+    assert state.hold_position[0] == pytest.approx(held_m)
+
+
 def test_a_stop_ends_the_retreat():
     state, _ = reduce(orbiting(), near(4.0), 10.0, None, LIMITS)
     state, _ = reduce(state, near(3.9), 10.1, None, LIMITS)
