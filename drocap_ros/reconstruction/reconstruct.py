@@ -31,6 +31,7 @@ from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.person_view import aside, lens_word, person_view, true_shape, with_lens
 from drocap_ros.reconstruction.shared_camera import SharedCamera, held, lower_ankle
+from drocap_ros.reconstruction.shots import joined, part_of, shots_meta, shots_of
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.refine import refinable
 from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
@@ -94,15 +95,30 @@ def reconstruct(
     Motion
         In frame "world" when the tracks hold the camera's rotation, else in frame "camera"; with the joints of the
         method, ``BODY_17`` or ``BODY_15``, and by the default method with the heels where the tracks hold them.
+        Where fixed points show cuts, each shot has a camera of its own; without one for each, frame "camera" it is.
 
     Raises
     ------
     InputError
         When the method is unknown or too few joints are seen.
     """
-    return reconstruct_with_camera(
-        tracks, method=method, initializer=initializer, adjuster=adjuster, progress=progress
-    )[0]
+
+    def of(clip: Tracks, progress: Progress | None) -> Motion:
+        return reconstruct_with_camera(
+            clip, method=method, initializer=initializer, adjuster=adjuster, progress=progress
+        )[0]
+
+    shots = shots_of(tracks)
+    if not shots.cuts:
+        return of(tracks, progress)
+    count = len(shots.tracks)
+    motions = [of(shot, part_of(progress, number, count)) for number, shot in enumerate(shots.tracks)]
+    if all(motion.frame == "world" for motion in motions):
+        motion = joined(motions)
+    else:
+        motion = of(dataclasses.replace(tracks, background=None), progress)
+    motion.meta.update(shots_meta(tracks, shots, motions))
+    return motion
 
 
 def reconstruct_with_camera(
