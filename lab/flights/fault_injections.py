@@ -177,9 +177,9 @@ def walk_to_vehicle(loop: OrbitLoop) -> None:
     joints[:, :, :2] += (np.minimum(steps_m(loop), length)[:, None] * way / length)[:, None]
 
 
-def walk_east(loop: OrbitLoop) -> None:
-    """The person walks away."""
-    loop.future_joints()[:, :, 0] += steps_m(loop)[:, None]
+def walk_east(loop: OrbitLoop, way_m: float = 40.0) -> None:
+    """The person walks away, so far."""
+    loop.future_joints()[:, :, 0] += np.minimum(steps_m(loop), way_m)[:, None]
 
 
 def steps_m(loop: OrbitLoop) -> np.ndarray:

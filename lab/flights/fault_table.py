@@ -1,10 +1,8 @@
-"""Table of the faults in flight, by the part that fails.
-
-``benchmarks/flight_faults.py`` flies all of them with both autopilots.
-"""
+"""Table of the faults in flight, by the part that fails; ``benchmarks/flight_faults.py`` flies all of them."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -269,9 +267,11 @@ _SUBJECT = (
     Fault("subject walks towards the vehicle", walk_to_vehicle, harmless=True),
     *(
         Fault(
-            name, walk_east, harmless=True, codes=(_C.AT_FENCE,), check=inside_fence, watch_s=14.0,
-            change=near_fence(bearing_deg),
-        ) for name, bearing_deg in (("subject leaves the fence", 0.0), ("subject drives it out", 180.0))
+            name, partial(walk_east, way_m=way_m), harmless=True, codes=(_C.AT_FENCE,), check=inside_fence,
+            watch_s=14.0, change=near_fence(bearing_deg),
+        ) for name, bearing_deg, way_m in (
+            ("subject leaves the fence", 0.0, 40.0), ("subject drives it out", 180.0, 5.0)
+        )
     ),
 )  # fmt: skip
 
