@@ -1,6 +1,6 @@
 """Table of faults in flight, for both dialects: `python benchmarks/flight_faults.py [--planned] [--seeds N] [WORDS]`.
 
-`--planned`: orbits by a plan whose wishes are drawn, as in `flight_orbits.py --planned`.
+`--planned`: orbits by a plan whose wishes are drawn, as in `flight_orbits.py --planned`; only faults in an orbit.
 
 `python benchmarks/flight_faults.py processes` flies the real `mavlink_bridge` process in real time instead, and kills
 and stops it and its perception.
@@ -15,6 +15,7 @@ import numpy as np
 from figures import table, write_figures
 
 from drocap_ros.flight.orbit_config import ACCURACY
+from drocap_ros.flight.orbit.states import State
 from drocap_ros.flight.orbit_goal import Wish
 from lab.flights.branches import over_processes
 from lab.flights.fault_flight import (
@@ -101,11 +102,12 @@ def main() -> int:
 
         return fly_processes()
     worst: list[list[str]] = []
+    faults = [number for number, fault in enumerate(FAULTS) if not args.planned or fault.state == State.ORBITING]
     part, parts = (int(number) for number in args.part.split("/"))
     cases = [
         (autopilot, number, args.seeds, args.planned)
         for autopilot in ((args.autopilot,) if args.autopilot else ("ardupilot", "px4"))
-        for number in range(part - 1, len(FAULTS), parts)
+        for number in faults[part - 1 :: parts]
         if not args.words or any(word in FAULTS[number].name for word in args.words)
     ]
     for cells in over_processes(flown, cases, args.jobs):
@@ -118,7 +120,7 @@ def main() -> int:
         f" harmless (h), {counts['-']} not kept (-)."
     )
     print(summary)
-    if len(worst) == 2 * len(FAULTS):  # a selection of cases must not replace the page
+    if len(worst) == 2 * len(faults):  # a selection of cases must not replace the page
         page = (
             ("flight_faults_planned", "Faults in planned flight")
             if args.planned
