@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 from figures import table, write_figures
 
-from drocap_ros.flight.orbit_config import ACCURACY
 from drocap_ros.flight.orbit.states import State
+from drocap_ros.flight.orbit_config import ACCURACY
 from drocap_ros.flight.orbit_goal import Wish
 from lab.flights.branches import over_processes
 from lab.flights.fault_flight import (
