@@ -132,8 +132,7 @@ def _evidence(
 ) -> np.ndarray | None:
     """(F, joints, 3) m, joints in space in the cameras' axes, of a lens as it is assumed; None = there are none.
 
-    Their errors are not told: those across the image, which the adjustment measures, stand beside the lifter's, which
-    are too small for real people by as much.
+    Their errors are left out: the adjustment measures them across the image, in each recording.
 
     mine : (F,) bool, the images of the subject; rois : (F, 4) px, its boxes
     """

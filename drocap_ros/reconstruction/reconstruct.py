@@ -111,8 +111,7 @@ def reconstruct(
     shots = shots_of(tracks)
     if not shots.cuts:
         return of(tracks, progress)
-    count = len(shots.tracks)
-    motions = [of(shot, part_of(progress, number, count)) for number, shot in enumerate(shots.tracks)]
+    motions = [of(shot, part_of(progress, n, len(shots.tracks))) for n, shot in enumerate(shots.tracks)]
     if all(motion.frame == "world" for motion in motions):
         motion = joined(motions)
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -87,9 +87,7 @@ def joined(motions: Sequence[Motion]) -> Motion:
     No picture relates two shots.  The person goes on from place and heading before the cut, on the same floor; the
     covariance is that within a shot.
     """
-    parts = [motions[0]]
-    for motion in motions[1:]:
-        parts.append(_continued(parts[-1], motion))
+    parts = list(accumulate(motions, _continued))
     # A shot that shows no heel has no heels.
     fewest = min(motions, key=lambda motion: len(motion.joints))
     arrays = {}

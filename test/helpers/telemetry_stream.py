@@ -59,10 +59,22 @@ class Orbit:
         return history
 
 
-def orbit(seconds: float, seed: int = 0, begin_ns: int = 0, track_id: int = 1, action: str = "walk") -> Orbit:
-    """A person of the assumed stature, filmed from 6 m at 25 deg/s."""
+def orbit(
+    seconds: float,
+    seed: int = 0,
+    begin_ns: int = 0,
+    track_id: int = 1,
+    action: str = "walk",
+    speed_deg_s: float = 25.0,
+) -> Orbit:
+    """A person of the assumed stature, filmed from 6 m."""
     config = SimulationConfig(
-        action=action, stature_m=1.70, attitude_error_deg=0.0, position_error_m=0.0, outlier_fraction=0.01
+        action=action,
+        stature_m=1.70,
+        attitude_error_deg=0.0,
+        position_error_m=0.0,
+        outlier_fraction=0.01,
+        angular_speed_deg_s=speed_deg_s,
     )
     capture = simulate_capture(seconds, FPS, seed, config, begin_ns, BODY_17)
     t = capture.tracks

@@ -86,7 +86,8 @@ def _stopping_place(seen: Observed, fresh: bool, fence: np.ndarray | None, radiu
     vehicle = seen.vehicle
     behind_s = 0.0 if fresh else max(vehicle.position_age_s - vehicle.age_s, 0.0)
     here: np.ndarray = vehicle.position + vehicle.velocity * behind_s
-    return here + _share_inside(here, way := _way_out(seen), fence, radius_m) * way
+    way = _way_out(seen)
+    return here + _share_inside(here, way, fence, radius_m) * way
 
 
 def _share_inside(here: np.ndarray, way: np.ndarray, fence: np.ndarray | None, radius_m: float) -> float:
@@ -96,7 +97,7 @@ def _share_inside(here: np.ndarray, way: np.ndarray, fence: np.ndarray | None, r
     """
     if fence is None:
         return 1.0
-    offset, step = (here[:2] - fence), way[:2]
+    offset, step = here[:2] - fence, way[:2]
     if np.hypot(*(offset + step)) <= radius_m:
         return 1.0
     room = radius_m**2 - float(offset @ offset)

@@ -113,7 +113,8 @@ def camera_from_points(
 def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> PictureCamera:
     """The path of a camera that moves: grown from a pair, or all at once where it moves little."""
     every = _starts(sightings, camera, key_hz)
-    starts = _right(every) or every
+    # Rays through a wrong lens can meet behind the camera as well: such a path is turned inside out.
+    starts = [start for start in every if start[1].behind < _BEHIND] or every
     if not starts:
         return replace(camera, kind=Kind.NOTHING_FIXED)
     least = min(start.path.residual_px for _, start in starts)
@@ -168,11 +169,6 @@ def _starts(sightings: Sightings, camera: PictureCamera, key_hz: float) -> list[
                 growths.append((pair, growth))
     growths.sort(key=lambda entry: -entry[0].score)
     return [(pair.parallax, growth) for pair, growth in growths if growth.path.known.sum() >= enough]
-
-
-def _right(starts: list[tuple[float, Growth]]) -> list[tuple[float, Growth]]:
-    """Those that are not turned inside out: rays through a wrong lens can meet behind the camera as well."""
-    return [(parallax, growth) for parallax, growth in starts if growth.behind < _BEHIND]
 
 
 def _turning(sightings: Sightings, camera: PictureCamera, fps: float) -> PictureCamera:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -47,30 +46,24 @@ class Kind(Enum):
         return self in (Kind.MOVES, Kind.STANDS, Kind.TURNS)
 
 
-class _Motion(NamedTuple):
-    """Of pairs (N,): median way of the points (px), what a turn leaves (px), what turn and zoom leave (px), zoom."""
-
-    way: np.ndarray
-    turned: np.ndarray
-    zoomed: np.ndarray
-    zoom: np.ndarray
-
-
 def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int) -> Kind:
     """What the camera does; ``Kind.MOVES`` where nothing simpler explains the points. ``width`` : of the image, px."""
     if cut_at(sightings) is not None:
         return Kind.CUT
     seeing = np.mean([len(rows) >= _LEAST_COMMON for rows in sightings.rows])
-    motion = _motion(sightings, matrix, key_hz)
-    if seeing < _SEEING or not len(motion.way):
+    pairs = _pairs(sightings, key_hz)
+    if seeing < _SEEING or not pairs:
         return Kind.FEW_POINTS
     same = _SAME_PX * width / _REFERENCE_WIDTH
-    if np.mean(motion.way < same) >= _MOST and np.mean(motion.way < 2 * same) >= 0.5 * (1.0 + _MOST):
+    # First, as turns and zooms take nearly all of the time: a camera on a tripod is asked in each live window.
+    way = np.array([np.median(np.linalg.norm(both.second - both.first, axis=1)) for both in pairs])
+    if np.mean(way < same) >= _MOST and np.mean(way < 2 * same) >= 0.5 * (1.0 + _MOST):
         return Kind.STANDS
-    if np.mean(motion.turned < same) >= _MOST:
+    turned, zoomed, zoom = _motion(pairs, matrix)
+    if np.mean(turned < same) >= _MOST:
         return Kind.TURNS
-    zooms = (motion.zoomed < same) & (np.abs(motion.zoom) > _ZOOM)
-    if zooms.any() and np.mean(motion.zoomed < same) >= _MOST:
+    zooms = (zoomed < same) & (np.abs(zoom) > _ZOOM)
+    if zooms.any() and np.mean(zoomed < same) >= _MOST:
         return Kind.ZOOMS
     return Kind.MOVES
 
@@ -89,14 +82,20 @@ def cut_at(sightings: Sightings) -> int | None:
 def turning_focal(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> float:
     """Factor on the focal length at which turns explain the points best; for a camera that turns in its place."""
     factors = np.geomspace(*_FOCALS)
-    rest = []
+    rest, pairs = [], _pairs(sightings, key_hz)
     for factor in factors:
         other = matrix * np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]])
-        rest.append(float(np.median(_motion(sightings, other, key_hz).turned)))
+        rest.append(float(np.median(_motion(pairs, other)[0])))
     return float(factors[int(np.argmin(rest))])
 
 
-def _motion(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> _Motion:
+def _motion(pairs: list[Common], matrix: np.ndarray) -> np.ndarray:
+    """(3, N) of pairs: what a turn leaves of the points' way (px), what turn and zoom leave (px), zoom."""
+    return np.array([_compare(both, matrix) for both in pairs]).reshape(-1, 3).T
+
+
+def _pairs(sightings: Sightings, key_hz: float) -> list[Common]:
+    """Points that pairs of keyframes have in common."""
     found = []
     for lag_s in _LAGS_S:
         lag = max(round(lag_s * key_hz), 1)
@@ -106,16 +105,15 @@ def _motion(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> _Motion:
         for first in np.unique(np.linspace(0, last, _PAIRS).astype(int)).tolist():
             both = sightings.common(first, first + lag)
             if len(both.piece) >= _LEAST_COMMON:
-                found.append(_compare(both, matrix))
-    return _Motion(*np.array(found).reshape(-1, 4).T)
+                found.append(both)
+    return found
 
 
-def _compare(both: Common, matrix: np.ndarray) -> tuple[float, float, float, float]:
-    way = float(np.median(np.linalg.norm(both.second - both.first, axis=1)))
+def _compare(both: Common, matrix: np.ndarray) -> tuple[float, float, float]:
     focal, first = float(matrix[0, 0]), rays(both.first, matrix)
     rotation, angle = turn_between(first, rays(both.second, matrix))
     zoom, zoomed = _turn_and_zoom(first @ rotation.T, (both.second - matrix[:2, 2]) / np.diagonal(matrix)[:2])
-    return way, focal * float(np.median(angle)), focal * zoomed, float(np.log(max(zoom, 1e-3)))
+    return focal * float(np.median(angle)), focal * zoomed, float(np.log(max(zoom, 1e-3)))
 
 
 def _turn_and_zoom(expected: np.ndarray, seen: np.ndarray) -> tuple[float, float]:

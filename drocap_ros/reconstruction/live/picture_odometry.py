@@ -1,17 +1,20 @@
 """Live windows without telemetry: the camera's path by fixed points alone, in a frame ``odom`` of the picture's own.
 
 A path begins as a recording's does (``camera/picture_world.py``): upright, in metres by the body.  The next window goes
-on with it: new keyframes are placed by its points, as a path grows offline, and images that both windows have keep
-their camera.  Where that fails, the path is lost, and another one begins at the last place and heading of the camera.
+on with it: new keyframes are placed by its points, as a path grows offline, and images in the time of both windows keep
+their camera.  They need not be the same images: a late adjustment takes every second to fourth.  Where that fails, the
+path is lost, and another one begins at the last place and heading of the camera.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.geometry.rotations import project_to_so3
+from drocap_ros.geometry.interpolation import interpolate
+from drocap_ros.geometry.rotations import matrix_from_quaternion, project_to_so3, quaternion_from_matrix
 from drocap_ros.reconstruction.camera.from_picture import fits
 from drocap_ros.reconstruction.camera.fusion import joints_by_camera
 from drocap_ros.reconstruction.camera.growth import Grown, Growth, adjusted, turns
@@ -39,6 +42,8 @@ _LARGEST_SCALE_STD = 0.3
 _STEPS = 5
 #: Error (m) of a place on a path, as windows differ in it.
 _PLACE_M = 0.02
+#: Longest time (s) between images of a window over which its path is straight.
+_STRAIGHT_S = 0.5
 #: Time (s) at a window's end in which a keyframe has to be placed.
 _NEWEST_S = 0.5
 
@@ -102,11 +107,9 @@ class PictureOdometry:
         assert last.camera_rotation is not None
         self._place = last.camera_position[-1], last.camera_rotation[-1]
         seen = _Seen(tracks)
-        cut = cut_at(seen.sightings)
-        kind = seen.kind(last)
-        if cut is not None:
+        if (cut := cut_at(seen.sightings)) is not None:
             at, why = int(tracks.stamp_ns[seen.image[seen.knots.frame[cut]]]), "a cut"
-        elif shared and kind.known:
+        elif shared and (kind := seen.kind(last)).known:
             # A camera that begins to move, say: nothing is wrong with the images of before.
             at, why = int(tracks.stamp_ns[0]), f"it is {kind.value} now"
         else:
@@ -159,17 +162,38 @@ class _Seen:
         return kind_of(self.sightings, last.camera_matrix, 1.0 / self.knots.step_s, last.image_size[0])
 
 
+class _Held(NamedTuple):
+    """Images (N,) of a window in the time of the one before, and the camera there: rotations and positions (N,)."""
+
+    image: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+def _held(last: Tracks, stamp_ns: np.ndarray) -> _Held:
+    """What the window before tells of images of stamps (F,), not all of which it has."""
+    assert last.camera_rotation is not None
+    assert last.camera_position is not None
+    inside = np.flatnonzero((stamp_ns >= last.stamp_ns[0]) & (stamp_ns <= last.stamp_ns[-1]))
+    turn, place = (
+        interpolate(last.stamp_ns, values, stamp_ns[inside], spherical=spherical, max_gap_s=_STRAIGHT_S)[0]
+        for values, spherical in ((quaternion_from_matrix(last.camera_rotation), True), (last.camera_position, False))
+    )
+    known = np.isfinite(place).all(axis=1)
+    return _Held(inside[known], matrix_from_quaternion(turn[known]), place[known])
+
+
 def _continued(before: PicturePath, tracks: Tracks) -> PicturePath | None:
-    """The path of the window before in a window that shares images with it; None = it is lost."""
-    last, seen = before.tracks, _Seen(tracks)
-    if cut_at(seen.sightings) is not None:
+    """The path of the window before in a window that shares time with it; None = it is lost."""
+    last, seen, held = before.tracks, _Seen(tracks), _held(before.tracks, tracks.stamp_ns)
+    if cut_at(seen.sightings) is not None or not len(held.image):
         return None
-    found = _grown(seen, last, tracks.stamp_ns) if before.world.camera.kind is Kind.MOVES else None
+    found = _grown(seen, last, held) if before.world.camera.kind is Kind.MOVES else None
     if found is None:
         found = _in_place(seen, last)
     if found is None:
         return None
-    rotation, position = _as_before(*found, last, tracks.stamp_ns)
+    rotation, position = _as_before(*found, held)
     tracks = replace(tracks, camera_rotation=rotation, camera_position=position, camera_matrix=last.camera_matrix)
     return replace(before, tracks=tracks)
 
@@ -183,16 +207,14 @@ def _in_place(seen: _Seen, last: Tracks) -> tuple[np.ndarray, np.ndarray] | None
     return (turns(seen.sightings, last.camera_matrix)[0][seen.slot], place) if kind is Kind.TURNS else None
 
 
-def _grown(seen: _Seen, last: Tracks, stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _grown(seen: _Seen, last: Tracks, held: _Held) -> tuple[np.ndarray, np.ndarray] | None:
     """Rotations and positions (F,) of a path that goes on, in a unit of its own; None = its points do not carry it."""
-    assert last.camera_rotation is not None
-    assert last.camera_position is not None
     assert last.camera_matrix is not None
     image = seen.image[seen.knots.frame]
-    known = (image >= 0) & np.isin(stamp_ns[image], last.stamp_ns)
-    theirs = np.searchsorted(last.stamp_ns, stamp_ns[image[known]])
+    known = np.isin(image, held.image)
+    theirs = np.searchsorted(held.image, image[known])
     rotation, position = np.tile(np.eye(3), (len(image), 1, 1)), np.zeros((len(image), 3))
-    rotation[known], position[known] = last.camera_rotation[theirs], last.camera_position[theirs]
+    rotation[known], position[known] = held.rotation[theirs], held.position[theirs]
     if known.sum() < 2:
         return None
     growth = Growth(seen.sightings, Grown(rotation, position, known, last.camera_matrix), 1.0 / seen.knots.step_s, 0.0)
@@ -208,16 +230,10 @@ def _grown(seen: _Seen, last: Tracks, stamp_ns: np.ndarray) -> tuple[np.ndarray,
     return found.rotation[at], found.position[at]
 
 
-def _as_before(
-    rotation: np.ndarray, position: np.ndarray, last: Tracks, stamp_ns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The path (F,) in the axes, at the place and in the metres that the images it shares with the last window have."""
-    assert last.camera_rotation is not None
-    assert last.camera_position is not None
-    here = np.flatnonzero(np.isin(stamp_ns, last.stamp_ns))
-    theirs = np.searchsorted(last.stamp_ns, stamp_ns[here])
-    turn = project_to_so3(np.einsum("fki,fkj->ij", last.camera_rotation[theirs], rotation[here]))
-    place, theirs_at = position[here] @ turn.T, last.camera_position[theirs]
+def _as_before(rotation: np.ndarray, position: np.ndarray, held: _Held) -> tuple[np.ndarray, np.ndarray]:
+    """The path (F,) in the axes, at the place and in the metres that the window before has."""
+    turn = project_to_so3(np.einsum("fki,fkj->ij", held.rotation, rotation[held.image]))
+    place, theirs_at = position[held.image] @ turn.T, held.position
     # The path keeps the metres that it began with: the adjustment may shrink it.  Only a way longer than the noise
     # measures by how much.
     spread, theirs_spread = (np.square(p - p.mean(axis=0)).sum(axis=1).mean() for p in (place, theirs_at))

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+import pytest
 from telemetry_stream import FPS, Orbit, orbit
 
 from drocap_ros.background import Background
@@ -16,17 +17,24 @@ from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.replay import LiveWindow, live_poses
-from drocap_ros.reconstruction.live.window import TelemetryUse
+from drocap_ros.reconstruction.live.window import Effort, TelemetryUse
 
 S = 10**9
 
 
-def windows(true: Orbit, points_at: Callable[[np.ndarray], Background | None]) -> list[LiveWindow]:
+def windows(
+    true: Orbit, points_at: Callable[[np.ndarray], Background | None], effort: Effort | None = None
+) -> list[LiveWindow]:
     """The windows of a stream with a calibration and without any pose of the camera."""
     lens = CameraHistory(60.0)
     lens.add_matrix(int(true.stamp_ns[0]), true.matrix)
     results = live_poses(
-        true.observations, InitializerConfig(), BundleAdjusterConfig(), camera_at=lens.along, points_at=points_at
+        true.observations,
+        InitializerConfig(),
+        BundleAdjusterConfig(),
+        effort_at=lambda _: effort or Effort(),
+        camera_at=lens.along,
+        points_at=points_at,
     )
     return [result for result in results if isinstance(result, LiveWindow)]
 
@@ -65,6 +73,28 @@ def test_windows_are_in_a_world_of_the_picture_with_its_up_and_metres() -> None:
         step = np.linalg.norm(camera_of(before)[1][at] - camera_of(after)[1][here], axis=1)
         assert step.max() < 0.1
         assert "path 1" in after.window.picture
+
+
+@pytest.mark.parametrize("stride", [2, 3, 4])
+@pytest.mark.parametrize("speed_deg_s", [25.0, 0.0])
+def test_a_path_goes_on_in_windows_that_share_no_image(speed_deg_s: float, stride: int) -> None:
+    true = orbit(7.0, speed_deg_s=speed_deg_s)
+    found = windows(true, true.points_at, Effort(stride))
+    there = [w for w in found if w.window.in_map is not None]
+    assert len(there) >= 3
+    assert there == found[-len(there) :]
+    shared = [np.isin(b.window.stamp_ns, a.window.stamp_ns).sum() for a, b in itertools.pairwise(there)]
+    assert stride == 3 or 0 in shared  # a window begins 24 images after the one before
+    for before, after in itertools.pairwise(there):
+        assert after.window.picture.startswith("path 1,")
+        assert after.window.lost == 0
+        first_ns, *_, last_ns = before.window.stamp_ns
+        at_ns = after.window.stamp_ns[(after.window.stamp_ns >= first_ns) & (after.window.stamp_ns <= last_ns)]
+        place = [
+            np.stack([np.interp(at_ns, w.window.stamp_ns, column) for column in camera_of(w)[1].T], axis=1)
+            for w in (before, after)
+        ]
+        assert np.linalg.norm(place[0] - place[1], axis=1).max() < 0.1
 
 
 def test_a_path_that_a_cut_ends_is_told_and_the_next_one_begins_at_its_place() -> None:
