@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from drocap_ros.reconstruction.common.stop_reason import NO_WINDOW
 from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort
+from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
 from drocap_ros.recording.published_poses import Agreement, PublishedPoses, RecordedCamera, RecordedPoints
@@ -25,6 +28,27 @@ from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.recording.session_tracks import most_frequent_subject
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
+
+logger = logging.getLogger(__name__)
+
+
+def replay(path: Path, config: DrocapConfig, progress: Progress | None = None) -> tuple[Motion, Tracks]:
+    """Motion and tracks of a recording by the live method, with its own parameters where ``config`` is the default.
+
+    Raises
+    ------
+    InputError
+        When it is no recording, or holds nothing that can be used.
+    """
+    if not path.exists() or not is_recording(path):
+        raise InputError(f"{path}: expected a recording with pose2d for method live, found none; use another method")
+    with open_session(path) as session:
+        if config == DrocapConfig():
+            config = recorded_config(session) or config
+        motion, tracks, _ = reconstruct_live(session, config, progress)
+        for warning in session.warnings:
+            logger.warning("%s: %s", path.name, warning)
+    return dataclasses.replace(motion, meta={**motion.meta, "input": path.name}), tracks
 
 
 def recorded_config(session: Session) -> DrocapConfig | None:

@@ -149,7 +149,7 @@ def reconstruct_everybody(
     found = {}
     for number, motion in motions.items():
         own: Values = {**origin, **more, "person": number, "seen": _when(tracks[number])}
-        found[number] = with_origin(motion, path, tracks[number], own, seconds), tracks[number]
+        found[number] = with_origin(motion, path, own, seconds), tracks[number]
     return found
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
-from drocap_ros.live_replay import reconstruct_live, recorded_config
+from drocap_ros.live_replay import replay
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import open_images, refuse_other_inputs
@@ -52,6 +53,7 @@ class Selection:
     evidence : file of 3D poses of its images by another system
     people : numbers of those whom :mod:`drocap_ros.people` reconstructs; empty = everybody
     threads : that share the work on the images; the result is the same with any number
+    on_tracks : called with the tracks and their origin, as in ``meta`` of the motion, before that is computed
     """
 
     clip: Clip = field(default_factory=Clip)
@@ -62,6 +64,7 @@ class Selection:
     evidence: Path | None = None
     people: tuple[int, ...] = ()
     threads: int = field(default=2, compare=False)
+    on_tracks: Callable[[Tracks, Values], None] | None = field(default=None, compare=False)
 
 
 #: A person counts after a confirmation, s; whoever is first seen before a clip's end is counted by then.
@@ -103,7 +106,7 @@ def reconstruct_input(
             raise InputError("--method live: expected a whole recording with its recorded poses; choose another method")
         if telemetry != _FOUND:
             raise InputError("--method live: expected the recorded telemetry, got other; leave the options out")
-        return _reconstruct_live(Path(path), config, progress)
+        return replay(Path(path), config, progress)
     begin = time.perf_counter()
     tracks, origin = _with_own_camera(Path(path), config, models, progress, telemetry, selection)
     if selection.evidence is not None:
@@ -111,10 +114,12 @@ def reconstruct_input(
     if selection.rate_hz:
         tracks = tracks.at_rate(selection.rate_hz)
     seconds = time.perf_counter() - begin
+    if selection.on_tracks is not None:
+        selection.on_tracks(tracks, origin)
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
-    return with_origin(motion, Path(path), tracks, origin, seconds), tracks
+    return with_origin(motion, Path(path), origin, seconds), tracks
 
 
 def _with_own_camera(
@@ -128,14 +133,15 @@ def _with_own_camera(
     """2D tracks with the camera's pose as telemetry or options give it, and their origin for ``meta``."""
     found = read_video_telemetry(path, telemetry)
     tracks, origin = read_input(path, config, models, progress, telemetry, selection)
+    origin.setdefault("images", {"size": list(tracks.image_size)})
     if found is not None:
         tracks, origin["telemetry"] = with_telemetry(path, tracks, telemetry, found, config.image_ingest, progress)
     return with_attitude(tracks, telemetry.attitude_deg), origin
 
 
-def with_origin(motion: Motion, path: Path, tracks: Tracks, origin: Values, seconds: float) -> Motion:
+def with_origin(motion: Motion, path: Path, origin: Values, seconds: float) -> Motion:
     """A motion whose ``meta`` says what it was made from; ``seconds`` : of reading the input."""
-    meta = {**motion.meta, "input": path.name, "images": {"size": list(tracks.image_size)}, **origin}
+    meta = {**motion.meta, "input": path.name, **origin}
     stages = {"pose2d": seconds, **meta.get("seconds", {})}
     meta["seconds"] = {**stages, "total": seconds + stages.get("total", 0.0)}
     return dataclasses.replace(motion, meta=meta)
@@ -163,11 +169,13 @@ def reconstruct_together(
         When an input cannot be used, or two do not show the same motion.
     """
     solved: list[SolvedView] = []
-    read: list[tuple[Path, Tracks, Values, float]] = []
+    read: list[tuple[Path, Values, float]] = []
+    tracks: list[Tracks] = []
     for path in paths:
         begin = time.perf_counter()
         own, origin = _with_own_camera(path, config, models, progress, telemetry, Selection(threads=threads))
-        read.append((path, own, origin, time.perf_counter() - begin))
+        read.append((path, origin, time.perf_counter() - begin))
+        tracks.append(own)
         solved.append(
             solve_view(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress)
         )
@@ -177,18 +185,7 @@ def reconstruct_together(
     for motion in motions:
         alone = motion.meta["seconds"]
         motion.meta["seconds"] = {**alone, "together": took, "total": alone["total"] + took}
-    return [(with_origin(motion, *of), of[1]) for motion, of in zip(motions, read, strict=True)]
-
-
-def _reconstruct_live(path: Path, config: DrocapConfig, progress: Progress | None) -> tuple[Motion, Tracks]:
-    if not path.exists() or not is_recording(path):
-        raise InputError(f"{path}: expected a recording with pose2d for method live, found none; use another method")
-    with open_session(path) as session:
-        if config == DrocapConfig():
-            config = recorded_config(session) or config
-        motion, tracks, _ = reconstruct_live(session, config, progress)
-        _log_warnings(session)
-    return dataclasses.replace(motion, meta={**motion.meta, "input": path.name}), tracks
+    return [(with_origin(motion, *of), own) for motion, of, own in zip(motions, read, tracks, strict=True)]
 
 
 def needs_networks(path: Path, redetect: bool) -> bool:

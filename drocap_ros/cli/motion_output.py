@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drocap_ros.clip import Clip, Progress
+    from drocap_ros.clip import Clip
     from drocap_ros.motion import Motion
+    from drocap_ros.report.motion_images import MotionImages
     from drocap_ros.tracks import Tracks
 
 
@@ -28,16 +29,18 @@ def output_names(args: argparse.Namespace, out: Path, clip: Clip) -> list[str]:
 def write_outputs(
     out: Path,
     names: list[str],
-    source: Path | None,
     motion: Motion,
     tracks: Tracks,
-    progress: Progress,
+    images: Callable[[Motion], MotionImages | None],
     beside: Sequence[Motion] = (),
 ) -> None:
-    """Write the output folder at once; ``beside`` : the motion as further cameras see it."""
+    """Write the output folder at once.
+
+    images : gives those of the report
+    beside : the motion as further cameras see it
+    """
     from drocap_ros.cli.atomic_output import output_folder
     from drocap_ros.motion import save_motion
-    from drocap_ros.report.motion_images import has_images
     from drocap_ros.report.page import save_report
     from drocap_ros.tracks import save_tracks
 
@@ -48,9 +51,7 @@ def write_outputs(
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)
         if "report.html" in names:
-            video = source if source and has_images(source) else None
-            former = out / "report.html"
-            save_report(folder / "report.html", motion, video=video, former=former, progress=progress)
+            save_report(folder / "report.html", motion, images=images(motion), former=out / "report.html")
     if "report.html" not in names:
         (out / "report.html").unlink(missing_ok=True)  # of an older motion
 

@@ -30,11 +30,16 @@ def progress_bars(quiet: bool = False, shares: Mapping[str, float] | None = None
         tasks: dict[str, TaskID] = {}
         names = list(shares or {})
 
+        reached = 0.0
+
         def show(stage: str, done: float) -> None:
+            nonlocal reached
             key, total = stage, None if done < 0 else 1.0
             if shares and stage in shares:
                 before = sum(shares[name] for name in names[: names.index(stage)])
-                key, done = "", before + shares[stage] * max(done, 0.0)
+                # Stages that run beside each other: the bar stays with the farthest.
+                key, done = "", max(reached, before + shares[stage] * max(done, 0.0))
+                reached = done
                 total = None if total is None else sum(shares.values())
             if key not in tasks:
                 tasks[key] = bars.add_task(stage, total=1.0)

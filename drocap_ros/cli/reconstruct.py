@@ -151,6 +151,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
     from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
     from drocap_ros.recording.keypoints.files import as_tracks_file
+    from drocap_ros.report.motion_images import ImagesBeside, has_images
 
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
     names = output_names(args, out, clip)
@@ -179,18 +180,20 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
             if not args.quiet:
                 print(text)
             return 0
-        motion, tracks = reconstruct_input(
-            source,
-            method=args.method,
-            config=config,
-            models=args.models,
-            progress=progress,
-            telemetry=telemetry,
-            selection=selection,
-        )
-        meta = {**motion.meta, "input": args.input.name, "command": args.command_line}
-        motion = dataclasses.replace(motion, meta=meta)
-        write_outputs(out, names, None if source != args.input else source, motion, tracks, progress)
+        shown = source == args.input and "report.html" in names and has_images(source)
+        with ImagesBeside(source if shown else None, progress) as images:
+            motion, tracks = reconstruct_input(
+                source,
+                method=args.method,
+                config=config,
+                models=args.models,
+                progress=progress,
+                telemetry=telemetry,
+                selection=dataclasses.replace(selection, on_tracks=images.begin if args.threads > 1 else None),
+            )
+            meta = {**motion.meta, "input": args.input.name, "command": args.command_line}
+            motion = dataclasses.replace(motion, meta=meta)
+            write_outputs(out, names, motion, tracks, images.of)
     if not args.quiet:
         print(f"{summary(motion, args.method, time.perf_counter() - begin)}\nwritten: {out}/{', '.join(names)}")
         if "report.html" in names:

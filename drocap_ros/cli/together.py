@@ -47,6 +47,7 @@ def run_together(args: argparse.Namespace) -> int:
     from drocap_ros.pipeline import needs_networks, reconstruct_together
     from drocap_ros.recording.keypoints.files import as_tracks_file
     from drocap_ros.recording.video_telemetry import Telemetry
+    from drocap_ros.report.motion_images import ImagesBeside, has_images
 
     inputs = [args.input, *args.further]
     _check(args, inputs)
@@ -73,8 +74,9 @@ def run_together(args: argparse.Namespace) -> int:
         motions = [
             dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line}) for motion, _ in found
         ]
-        video = sources[0] if sources[0] == args.input else None
-        write_outputs(out, names, video, motions[0], found[0][1], progress, motions[1:])
+        video = sources[0] if sources[0] == args.input and has_images(sources[0]) else None
+        images = stack.enter_context(ImagesBeside(video, progress))
+        write_outputs(out, names, motions[0], found[0][1], images.of, motions[1:])
     if not args.quiet:
         print(summary(motions[0], "ba", time.perf_counter() - begin))
         print(view_words(motions[0]))

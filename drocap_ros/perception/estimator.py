@@ -77,6 +77,8 @@ class PoseEstimator:
         self._certain: PoseObservation | None = None
         #: Last run of the detector, and last image in which it, the pose or the optical flow showed the subject.
         self._detected_ns = self._seen_ns = 0
+        #: Whether the detector ran in the last image: then it mostly runs in the next one, too.
+        self._searching = False
         #: Score of the subject in the last detection, and mean confidence of its last keypoints; 0 = none.
         self._score = self._confidence = 0.0
         #: (4,) margins of the last box around the joints, over the joints' longer extent; None unless both were clear.
@@ -152,8 +154,9 @@ class PoseEstimator:
                 self._failures, self._seen_ns = 0, stamp_ns
                 return moved, True
             predicted = self._estimate_predicted(image, stamp_ns, load_level)
-        if predicted and predicted[1]:
-            self._seen_ns = stamp_ns
+        if predicted is not None:
+            self._searching = False
+            self._seen_ns = stamp_ns if predicted[1] else self._seen_ns
         observation, certain = predicted or self._estimate_detected(image, stamp_ns, roi, load_level)
         # Doubtful persons are not propagated by optical flow; the detector runs again.
         self._flow.start(image if load_level and certain else None, observation)
@@ -173,6 +176,9 @@ class PoseEstimator:
         kept = without_parts(everything.boxes, everything.scores)
         found = Detections(everything.boxes[kept], everything.scores[kept])
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
+        if self._ahead is not None and self._searching and not shedding:
+            self._search.begin(self._ahead[0].image, self._ahead[0].stamp_ns, self._beside)
+        self._searching = True
         if subject is None:
             self._failures = 0
             self._others.judge_bystander(image, stamp_ns, None, self._motion, shedding=False)

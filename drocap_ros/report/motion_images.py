@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,6 +23,7 @@ from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.sources.base import prefetch
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
+from drocap_ros.tracks import Tracks
 
 #: Most images in a report, and bytes of all together, as base64: the page stays quick to open and to mail.
 MAX_IMAGES = 300
@@ -52,6 +57,52 @@ class MotionImages:
     box: tuple[int, int, int, int]
 
 
+class ShownTracks(NamedTuple):
+    """What says which images are a motion's, and where its subject is in them; fields as of ``Motion``."""
+
+    stamp_ns: np.ndarray
+    keypoints: np.ndarray
+    meta: Mapping[str, object]
+
+
+Shown: TypeAlias = Motion | ShownTracks
+
+
+class ImagesBeside(AbstractContextManager["ImagesBeside"]):
+    """Reads the images of a motion in another thread while the motion is computed.
+
+    path : source of the motion; None = it has no images
+    """
+
+    def __init__(self, path: Path | None, progress: Progress) -> None:
+        self._path, self._progress = path, progress
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="images")
+        self._stop = threading.Event()
+        self._read: Future[MotionImages] | None = None
+
+    def begin(self, tracks: Tracks | Motion, meta: Mapping[str, object]) -> None:
+        """Begin to read, as soon as the motion's tracks and what its ``meta`` says of the images are known."""
+        if self._path is not None:
+            shown = ShownTracks(tracks.stamp_ns, tracks.keypoints, meta)
+            self._read = self._pool.submit(read_motion_images, self._path, shown, self._unless_stopped)
+
+    def of(self, motion: Motion) -> MotionImages | None:
+        """The images of the motion; they are read now where nobody has begun."""
+        if self._read is None:
+            self.begin(motion, motion.meta)
+        return None if self._read is None else self._read.result()
+
+    def _unless_stopped(self, stage: str, done: float) -> None:
+        if self._stop.is_set():
+            raise CancelledError
+        self._progress(stage, done)
+
+    def __exit__(self, *_: object) -> None:
+        """End the thread, after a failure before its last image."""
+        self._stop.set()
+        self._pool.shutdown()
+
+
 def has_images(path: Path) -> bool:
     """Whether an input of ``drocap reconstruct`` holds images for a report."""
     if path.suffix == ".npz":
@@ -62,7 +113,7 @@ def has_images(path: Path) -> bool:
         return bool(session.topics_of(IMAGE, COMPRESSED_IMAGE))
 
 
-def read_motion_images(path: Path, motion: Motion, progress: Progress | None = None) -> MotionImages:
+def read_motion_images(path: Path, motion: Shown, progress: Progress | None = None) -> MotionImages:
     """Images of a motion out of its video, folder or recording.
 
     Frames are matched by their stamps; without a common clock both start with their first frame.
@@ -89,7 +140,7 @@ def read_motion_images(path: Path, motion: Motion, progress: Progress | None = N
     return MotionImages(tuple(frames), tuple(jpegs), encode.box)
 
 
-def each_image(path: Path, motion: Motion) -> Iterator[tuple[int, np.ndarray]]:
+def each_image(path: Path, motion: Shown) -> Iterator[tuple[int, np.ndarray]]:
     """Index and image (H, W, 3) uint8 BGR of every frame that has one; matched as in :func:`read_motion_images`.
 
     Raises
@@ -111,7 +162,7 @@ def _no_images(path: Path) -> InputError:
 
 
 @contextlib.contextmanager
-def _opened(path: Path, motion: Motion) -> Iterator[Images]:
+def _opened(path: Path, motion: Shown) -> Iterator[Images]:
     """Images of a path; refused when they cannot be those of the motion."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
@@ -123,7 +174,7 @@ def _opened(path: Path, motion: Motion) -> Iterator[Images]:
             yield images._replace(frames=_checked_sizes(path, frames, motion))
 
 
-def _check_times(path: Path, images: Images, motion: Motion) -> None:
+def _check_times(path: Path, images: Images, motion: Shown) -> None:
     """Refuse images of another number or rate than ``meta`` states, or else that cannot be at the motion's times."""
     stated = _stated(motion, "images")
     for expected, got, share, slack, words in (
@@ -135,7 +186,7 @@ def _check_times(path: Path, images: Images, motion: Motion) -> None:
     _check_span(path, images, motion)
 
 
-def _check_span(path: Path, images: Images, motion: Motion) -> None:
+def _check_span(path: Path, images: Images, motion: Shown) -> None:
     """Refuse images whose rate or duration does not fit the motion's stamps, where ``meta`` states no number."""
     stated = _stated(motion, "images")
     if stated.get("length") or images.rate_hz is None or images.duration_s is None or len(motion.stamp_ns) < 2:
@@ -149,7 +200,7 @@ def _check_span(path: Path, images: Images, motion: Motion) -> None:
         raise _other(path, f"at least {length_ns * 1e-9:.1f} s", f"{images.duration_s:.1f} s")
 
 
-def _checked_sizes(path: Path, frames: Iterable[Frame], motion: Motion) -> Iterator[Frame]:
+def _checked_sizes(path: Path, frames: Iterable[Frame], motion: Shown) -> Iterator[Frame]:
     """The frames; refused when the first has another size than the images of the motion."""
     for number, frame in enumerate(frames):
         if number == 0:
@@ -157,7 +208,7 @@ def _checked_sizes(path: Path, frames: Iterable[Frame], motion: Motion) -> Itera
         yield frame
 
 
-def _check_size(path: Path, width: int, height: int, motion: Motion) -> None:
+def _check_size(path: Path, width: int, height: int, motion: Shown) -> None:
     if size := _stated(motion, "images").get("size"):
         if size != [width, height]:
             raise _other(path, f"size {size} px", f"{width}x{height} px")
@@ -168,7 +219,7 @@ def _check_size(path: Path, width: int, height: int, motion: Motion) -> None:
         raise _other(path, "its keypoints inside the images", f"{outside:.0%} of them outside {width}x{height} px")
 
 
-def _stated(motion: Motion, name: str) -> dict[str, object]:
+def _stated(motion: Shown, name: str) -> dict[str, object]:
     """An entry of ``meta`` that is a table; empty where it is none."""
     value = motion.meta.get(name)
     return value if isinstance(value, dict) else {}
@@ -178,7 +229,7 @@ def _other(path: Path, expected: str, found: str) -> InputError:
     return InputError(f"{path}: expected the images of this motion with {expected}, found {found}; name its own video")
 
 
-def _matched(images: Images, motion: Motion, wanted: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+def _matched(images: Images, motion: Shown, wanted: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Images of the wanted frames: the nearest to each stamp within half a frame."""
     stamp_ns = motion.stamp_ns
     half = int(np.median(np.diff(stamp_ns)) / 2) if len(stamp_ns) > 1 else 50_000_000
@@ -206,7 +257,7 @@ def _matched(images: Images, motion: Motion, wanted: np.ndarray) -> Iterator[tup
         yield from nearest([before])
 
 
-def _clock_offset_ns(motion: Motion, first_ns: int, duration_s: float | None, half_ns: int) -> int:
+def _clock_offset_ns(motion: Shown, first_ns: int, duration_s: float | None, half_ns: int) -> int:
     """Time from the images' clock to the motion's, ns: 0 where the motion lies within the images' time.
 
     A motion begins after its first image where the first poses were left out: without a subject or telemetry.
@@ -231,7 +282,7 @@ def _slack_ns(length_ns: int) -> int:
 class _Encoder:
     """Crops, shrinks and compresses each image into its share of the bytes."""
 
-    def __init__(self, motion: Motion, shape: tuple[int, ...], count: int) -> None:
+    def __init__(self, motion: Shown, shape: tuple[int, ...], count: int) -> None:
         height, width = shape[:2]
         self.box = subject_box(motion.keypoints, width, height)
         x0, y0, x1, y1 = self.box

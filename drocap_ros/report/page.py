@@ -29,6 +29,7 @@ def save_report(
     motion: Motion,
     *,
     video: Path | None = None,
+    images: MotionImages | None = None,
     former: Path | None = None,
     command: str = "",
     progress: Progress | None = None,
@@ -37,8 +38,9 @@ def save_report(
 
     Parameters
     ----------
-    video : source of the motion, for its images; None = those of the former report, or 2D keypoints alone
-    former : report whose images are kept where it shows the same keypoints; it may be missing
+    video : source of the motion, for its images
+    images : those of the motion, where they were read already
+    former : report whose images are kept, where there are no others and it shows the same keypoints; it may be missing
     command : command line of the report, shown beside the one in the motion's ``meta``
     progress : called with the stage "report" and its completed share
 
@@ -47,7 +49,8 @@ def save_report(
     InputError
         When the motion holds no pose or lacks the joints of a torso, or the video cannot be used.
     """
-    images = read_motion_images(video, motion, progress) if video is not None else None
+    if video is not None:
+        images = read_motion_images(video, motion, progress)
     if images is None and former is not None:
         images = images_of_page(former, motion)
     Path(path).write_text(render_report(motion, images, command), encoding="utf-8")

@@ -1,5 +1,7 @@
 """The steps of an image beside each other: the same observations with any number of threads."""
 
+import threading
+
 import numpy as np
 import pytest
 from rendered_person import rendered_images
@@ -10,6 +12,7 @@ from drocap_ros.perception.load_models import SIMULATION, models_folder
 from drocap_ros.perception.scene import Scene
 from drocap_ros.perception.sources.base import Frame, in_order
 from drocap_ros.perception.track_video import observe
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 pytest.importorskip("onnxruntime")
 
@@ -35,6 +38,27 @@ def test_observations_are_the_same_bit_for_bit_with_one_thread_and_with_more(fra
         if a.background is not None:
             assert np.array_equal(a.background.track, b.background.track)
             assert np.array_equal(a.background.point, b.background.point)
+
+
+def detector_runs(frames, threads):
+    """The thread of each run of the detector, and the roi of each image, of images that all need the detector."""
+    estimator = PoseEstimator(models_folder(SIMULATION), PoseEstimatorConfig(detect_every_s=0.0))
+    detect, runs = estimator.detector.detect, []
+
+    def counted(*arguments):
+        runs.append(threading.current_thread())
+        return detect(*arguments)
+
+    estimator.detector.detect = counted
+    return runs, [seen.roi for seen in observe(iter(frames), estimator, threads=threads)]
+
+
+def test_the_detector_runs_beside_the_pose_network_and_hardly_more_often(frames):
+    (alone, rois), (shared, same) = (detector_runs(frames[:15], threads) for threads in (1, 2))
+    assert np.array_equal(rois, same)
+    assert set(alone) == {threading.current_thread()}
+    assert sum(thread is not threading.current_thread() for thread in shared) > len(shared) / 2
+    assert len(shared) <= len(alone) + 2
 
 
 def test_of_a_long_recording_the_points_of_every_second_or_fourth_image_are_kept(frames, monkeypatch):

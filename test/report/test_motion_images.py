@@ -1,6 +1,7 @@
 """Images for the report out of videos and folders: the right ones, cropped, within their bytes."""
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from report_motions import first_frames
 
 from drocap_ros.errors import InputError
 from drocap_ros.report import motion_images
-from drocap_ros.report.motion_images import has_images, read_motion_images
+from drocap_ros.report.motion_images import ImagesBeside, has_images, read_motion_images
 from drocap_ros.report.page_data import page_data
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
@@ -49,6 +50,31 @@ def test_images_match_the_frames_by_their_stamps(person, folder):
     found = read_motion_images(folder, seen_at(person, stamps))
     assert found.frames == tuple(range(20))
     assert [level(j) for j in found.jpegs] == pytest.approx([5 * n + 20 for n in range(0, 40, 2)], abs=1)
+
+
+def test_images_begun_with_the_tracks_are_those_of_the_motion(person, folder):
+    motion = seen_at(person, np.round(np.arange(0, 40, 2) / 30.0 * 1e9))
+    with ImagesBeside(folder, lambda *_: None) as images:
+        images.begin(motion, motion.meta)
+        assert images.of(motion) == read_motion_images(folder, motion)
+    with ImagesBeside(folder, lambda *_: None) as images:
+        assert images.of(motion) == read_motion_images(folder, motion)
+
+
+def test_a_failure_beside_ends_the_reading_of_images(person, folder):
+    motion = seen_at(person, np.round(np.arange(40) / 30.0 * 1e9))
+    read, go_on = [], threading.Event()
+
+    def progress(*done):
+        read.append(done)
+        go_on.wait(30)
+
+    images = ImagesBeside(folder, progress)
+    images.begin(motion, motion.meta)
+    threading.Timer(0.5, go_on.set).start()
+    with pytest.raises(InputError), images:
+        raise InputError("no pose")
+    assert len(read) <= 1
 
 
 def test_a_motion_with_another_clock_starts_with_the_first_image(person, folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor, Future
 from functools import reduce
 
 import numpy as np
@@ -44,6 +45,8 @@ class SubjectSearch:
         self._full_ns: int | None = None  # last detection over the whole image
         self._tile = self._turn = 0
         self._alternate = False
+        #: The next image, and detections in windows of it that another thread makes.
+        self._begun: tuple[np.ndarray, dict[Window | None, Future[Detections]]] | None = None
 
     def detect(self, image: np.ndarray, stamp_ns: int, shedding: bool, close: bool) -> Detections:
         """Detections of all windows together, parts of persons among them.
@@ -60,6 +63,17 @@ class SubjectSearch:
             if (window := further(subject, found, size, stamp_ns)) is not None:
                 found = _merged(found, self._detect_in(image, window, False))
         return found
+
+    def begin(self, image: np.ndarray, stamp_ns: int, beside: Executor) -> None:
+        """Begin to detect in the next image, where the subject will be if its pose in this one changes nothing.
+
+        The results are those of :meth:`detect` without it: another window is searched anew.
+        """
+        subject = self._tracker.followed(stamp_ns)
+        size = (image.shape[1], image.shape[0])
+        near = None if subject is None else window_around(subject.filter.box_at(stamp_ns), size, WIDE)
+        windows = {near, None} if self._full_image_due(stamp_ns) else {near}
+        self._begun = image, {window: beside.submit(self._found_in, image, window, False) for window in windows}
 
     def isolated(self, predicted: np.ndarray, image_size: tuple[int, int], stamp_ns: int) -> bool:
         """Whether a subject at this box (4,) px is away from others and from the edges, and no full image is due."""
@@ -157,7 +171,12 @@ class SubjectSearch:
         return max(recent, key=lambda p: (p.hits < self._config.confirm_frames, p.mean_score), default=None)
 
     def _detect_in(self, image: np.ndarray, window: Window | None, shedding: bool) -> Detections:
-        """Detections in a window, without those that its edge cuts."""
+        """Detections in a window, without those that its edge cuts; perhaps already begun."""
+        if self._begun is not None and self._begun[0] is image and not shedding and window in self._begun[1]:
+            return self._begun[1][window].result()
+        return self._found_in(image, window, shedding)
+
+    def _found_in(self, image: np.ndarray, window: Window | None, shedding: bool) -> Detections:
         reduced = None if not shedding else 1.0 if window is None else _REDUCED_INPUT
         found = self._detector.detect(image, window, self._config.low_threshold, reduced)
         kept = uncut(found.boxes, window, (image.shape[1], image.shape[0]))
