@@ -13,7 +13,7 @@ import numpy as np
 
 from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.geometry.position_steps import without_steps
-from drocap_ros.geometry.rotations import exp_so3, log_so3, project_to_so3
+from drocap_ros.geometry.rotations import exp_so3, hat, log_so3, project_to_so3
 from drocap_ros.reconstruction.camera.causes import contradicted_share, single_causes
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
 from drocap_ros.reconstruction.camera.path_model import (
@@ -53,6 +53,9 @@ _OTHER = 1.5
 _LEAST_COVERED = 0.5
 #: Median residual (px per 1000 px of focal length) above which no camera's path explains the points.
 _LARGEST_RESIDUAL = 3.0
+#: Slow errors (degrees) of a reported turn above which it is another flight's: a gimbal's yaw that jumps by 9 degrees,
+#: the largest jump that is not refused as one, has 3; logs of other flights had 17 to 57.
+_LARGEST_TURN_DEG = 10.0
 #: Latency (s) from which the reports are shifted, and the largest share of it that its standard deviation may be.
 _LONG_S = 0.02
 _SURE = 0.2
@@ -144,8 +147,8 @@ def _of_window(
     inside = (frame >= 0) & (frame < given.frames)
     views = views_of(frame[inside], points.track[inside], points.point[inside], given.frames, given.fps)
     found = _adjusted(PathInput(given, matrix, views, path_config(config), known))
-    if found is None or found.covered < _LEAST_COVERED:
-        return None
+    if not isinstance(found, AdjustedPath) or found.covered < _LEAST_COVERED:
+        return found if isinstance(found, Refusal) else None
     if found.residual_px > _LARGEST_RESIDUAL * 1e-3 * float(matrix[0, 0]):
         return Refusal(Why.POINTS_MOVE_OTHERWISE, found.residual_px)
     return found
@@ -163,7 +166,7 @@ def path_config(config: WorldConfig) -> PathConfig:
     )
 
 
-def _adjusted(data: PathInput) -> AdjustedPath | None:
+def _adjusted(data: PathInput) -> AdjustedPath | Refusal | None:
     """The path by errors as they are expected, or by larger ones where the points show such.
 
     Errors that are expected to wander far would take the part of a constant yaw.
@@ -194,6 +197,9 @@ def _adjusted(data: PathInput) -> AdjustedPath | None:
     second = adjust_path(data, first.state)
     if second is None or second.posterior is None:
         return first
+    left_deg = _wander(second, given.fps)[1]
+    if left_deg > _LARGEST_TURN_DEG and second.covered >= _LEAST_COVERED:
+        return Refusal(Why.POINTS_TURN_OTHERWISE, left_deg)
     return _in_its_place(_without_latency(data, second), position_m, given.fps)
 
 
@@ -328,11 +334,8 @@ def with_camera_errors(
 
     rotation, position : of another camera than ``refined`` has
     """
-    lever = joints_by_camera(
-        refined.joints,
-        refined.rotation if rotation is None else rotation,
-        refined.position if position is None else position,
-    )
+    turn, place = (refined.rotation, refined.position) if rotation is None or position is None else (rotation, position)
+    lever = joints_by_camera(refined.joints, turn, place)
     more = lever @ errors[:, None] @ np.swapaxes(lever, -1, -2)
     return replace(refined, covariance=refined.covariance + pack_covariance(more))
 
@@ -342,8 +345,5 @@ def joints_by_camera(joints: np.ndarray, rotation: np.ndarray, position: np.ndar
 
     rotation : (F, 3, 3) world -> camera, which changes by a turn (rad) in camera axes; position : (F, 3) m
     """
-    x, y, z = np.moveaxis(joints - position[:, None], -1, 0)
-    none = np.zeros_like(x)
-    across = np.stack([np.stack(row, -1) for row in ((none, -z, y), (z, none, -x), (-y, x, none))], -2)
-    turned = across @ np.swapaxes(rotation, 1, 2)[:, None]
+    turned = hat(joints - position[:, None]) @ np.swapaxes(rotation, 1, 2)[:, None]
     return np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=-1)

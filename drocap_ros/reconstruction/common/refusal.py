@@ -29,6 +29,11 @@ class Why(Enum):
         "fixed points of the picture lie {:.1f} px off where the reported camera sees them; check that the log belongs"
         " to the video, its time offset and the lens"
     )
+    #: Correcting the reported turns by fixed points leaves errors that wander: their standard deviation in degrees.
+    POINTS_TURN_OTHERWISE = (
+        "fixed points of the picture turn otherwise than the reported camera, by {:.0f} deg; check that the log belongs"
+        " to the video, its time offset and the lens"
+    )
     NO_FOOT_RESTS = (
         "no foot of the body ever rests on its path in the world; check that the log belongs to the video, its "
         "time offset and the gimbal's yaw (or the person glides)"
@@ -40,10 +45,13 @@ class Refusal:
     """Telemetry that cannot be true; ``str`` of it is one line for people.
 
     measured : the number of the sentence, in the unit that ``why`` states; 0 where it has none
+    again_s : time until a live window asks again; 0 = the next one does
     """
 
     why: Why
     measured: float = 0.0
+    again_s: float = 0.0
 
     def __str__(self) -> str:
-        return self.why.value.format(self.measured)
+        again = f"; asked again after {self.again_s:.0f} s" if self.again_s else ""
+        return self.why.value.format(self.measured) + again

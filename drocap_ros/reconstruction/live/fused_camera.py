@@ -15,8 +15,9 @@ from drocap_ros.geometry.rotations import exp_so3, project_to_so3
 from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, path_config
 from drocap_ros.reconstruction.camera.path_model import ATTITUDE_LATENCY, MISALIGNMENT, POSITION_LATENCY
 from drocap_ros.reconstruction.camera.path_residuals import expected_shared
-from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.common.refusal import Refusal, Why
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.live.window import Retry
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, at_other_time
 from drocap_ros.reconstruction.world.even_capture import at_all_slots
 from drocap_ros.reconstruction.world.findings import Findings
@@ -55,14 +56,13 @@ class FusedCamera:
     """Corrects one window's reports after the other; memory is that of a window."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the reports."""
         self._known = Findings.unknown()
         #: Images (F,) of the last window, and the findings of their points.
         self._last: tuple[np.ndarray, Findings] | None = None
         self.calibration: Calibration | None = None
+        #: Why points refuse the reports, and when they are asked again: that takes as long as some adjustments.
+        self._refusal: Refusal | None = None
+        self._retry = Retry()
         #: The largest errors (deg, m, deg) that points have shown, which later windows expect from the start.
         self._shown: np.ndarray = np.zeros(3)
 
@@ -71,6 +71,9 @@ class FusedCamera:
         rotation, position, (tilt_deg, place_m, turn_deg) = tracks.camera_rotation, tracks.camera_position, self._shown
         if tracks.background is None or rotation is None or position is None:
             return None
+        newest_ns = int(tracks.stamp_ns[-1])
+        if self._refusal is not None and not self._retry.due(newest_ns):
+            return self._refusal
         known = self._known if self._last is None else self._known.after(self._last[1], self._last[0], tracks.stamp_ns)
         config = replace(
             config,
@@ -87,8 +90,14 @@ class FusedCamera:
         turned = exp_so3(mean[None, MISALIGNMENT]) @ later.rotation
         without = replace(tracks, camera_rotation=turned[slot], camera_position=later.position[slot])
         fused = fuse_telemetry(without, config, known.precision)
+        self._refusal = None
+        if isinstance(fused, Refusal) and fused.why in (Why.POINTS_MOVE_OTHERWISE, Why.POINTS_TURN_OTHERWISE):
+            self._retry.failed(newest_ns)
+            self._refusal = replace(fused, again_s=self._retry.last_s)
+            return self._refusal
         if isinstance(fused, Refusal) or fused is None:
             return fused
+        self._retry = Retry()
         precision, vector = fused.path.facts
         self._known = known
         self._last = tracks.stamp_ns, Findings(precision, vector + precision @ mean)

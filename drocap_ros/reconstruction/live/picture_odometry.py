@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.geometry.interpolation import interpolate
-from drocap_ros.geometry.rotations import matrix_from_quaternion, project_to_so3, quaternion_from_matrix
+from drocap_ros.geometry.rotations import hat, matrix_from_quaternion, project_to_so3, quaternion_from_matrix
 from drocap_ros.reconstruction.camera.from_picture import fits
 from drocap_ros.reconstruction.camera.fusion import joints_by_camera
 from drocap_ros.reconstruction.camera.growth import Grown, Growth, adjusted, turns
@@ -25,6 +25,7 @@ from drocap_ros.reconstruction.camera.sightings import Sightings
 from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.live.window import Retry
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.world_model import WorldConfig
@@ -32,10 +33,6 @@ from drocap_ros.tracks import Tracks
 
 #: Shortest window (s) in which a path begins: a step and some way, and points in most of it.
 _FIRST_S = 3.0
-#: Time (s) after a search that found no path, until the next, and the longest after more of them: a search costs as
-#: much as some adjustments.
-_PAUSE_S = 4.0
-_LONGEST_PAUSE_S = 60.0
 #: Deviation of the logarithm of a path's metres above which they are guessed: longer windows tell more, of a lens too.
 _LARGEST_SCALE_STD = 0.3
 #: Steps of a path that goes on: most of it is known.
@@ -79,9 +76,9 @@ class PictureOdometry:
         self._path: PicturePath | None = None
         #: Where the last path ended: position (3,) m and rotation (3, 3) of the camera.
         self._place: tuple[np.ndarray, np.ndarray] | None = None
-        #: First image, by its stamp, of the next path, and of the next search for one.
-        self.since_ns = self._retry_ns = 0
-        self._number, self._pause_s = 0, _PAUSE_S
+        #: First image, by its stamp, of the next path.
+        self.since_ns = 0
+        self._number, self._retry = 0, Retry()
         #: Why there is no path or the last one ended, in words, and how many were lost.
         self.lost, self.losses = "", 0
 
@@ -97,7 +94,7 @@ class PictureOdometry:
             if self._path is None:
                 self._lose(before, tracks, shared)
         long = stamps[-1] - stamps[0] >= _FIRST_S * 1e9
-        if self._path is None and self.since_ns <= stamps[0] and stamps[-1] >= self._retry_ns and long:
+        if self._path is None and self.since_ns <= stamps[0] and self._retry.due(int(stamps[-1])) and long:
             self._path = self._begun(tracks, poses, height_m, config)
         return self._path
 
@@ -132,14 +129,14 @@ class PictureOdometry:
             return None
         if self._place is not None:
             tracks = _from(tracks, *self._place)
-        self._number, self._pause_s = self._number + 1, _PAUSE_S
+        self._number, self._retry = self._number + 1, Retry()
         scale = _way(tracks) / max(float(np.linalg.norm(np.ptp(camera.position, axis=0))), 1e-9)
         drift = np.nan_to_num([scale * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)
         return PicturePath(tracks, world, self._number, int(tracks.stamp_ns[0]), float(drift[0]), float(drift[1]))
 
     def _pause(self, why: str, tracks: Tracks) -> None:
-        self._retry_ns = int(tracks.stamp_ns[-1]) + round(self._pause_s * 1e9)
-        self._pause_s, self.lost = min(2.0 * self._pause_s, _LONGEST_PAUSE_S), f"no path: {why}"
+        self._retry.failed(int(tracks.stamp_ns[-1]))
+        self.lost = f"no path: {why}"
 
 
 class _Seen:
@@ -276,10 +273,8 @@ def own_covariance(path: PicturePath, joints: np.ndarray, stature_std: float) ->
     # A way has an unknown factor as a whole; without one the distance of a person of unknown stature is unknown.
     arm = joints if moves else joints - tracks.camera_position[:, None]
     out = (upright.scale_std if moves else stature_std) ** 2 * arm[..., :, None] * arm[..., None, :]
-    x, y, z = np.moveaxis(joints, -1, 0)
-    none = np.zeros_like(x)
-    for tilted in (np.stack([none, -z, y], axis=-1), np.stack([z, none, -x], axis=-1)):
-        out += np.deg2rad(upright.std_deg) ** 2 * tilted[..., :, None] * tilted[..., None, :]
+    tilted = hat(joints)[..., :2]
+    out += np.deg2rad(upright.std_deg) ** 2 * (tilted @ np.swapaxes(tilted, -1, -2))
     lever = joints_by_camera(joints, tracks.camera_rotation, tracks.camera_position)
     seconds = np.maximum(tracks.stamp_ns - path.begun_ns, 0) * 1e-9
     drift = seconds[:, None] * np.repeat([path.drift_m, path.drift_rad], 3) ** 2

@@ -15,6 +15,9 @@ from drocap_ros.keypoints import Keypoints2D
 
 #: Share of the allowed time above which the next window gets coarser: a tenth is left for its spread.
 _TOO_LONG = 0.9
+#: Time (s) after the first costly search without a result, and the longest after more of them; each doubles it.
+_FIRST_PAUSE_S = 4.0
+_LONGEST_PAUSE_S = 60.0
 
 
 class Window(NamedTuple):
@@ -93,6 +96,22 @@ class EffortControl:
         # A finer window has to stay below half of that, so that strides do not alternate.
         elif self.stride > 1 and seconds * self.stride / (self.stride - 1) < 0.5 * _TOO_LONG * self._allowed_s:
             self.stride -= 1
+
+
+class Retry:
+    """The pause after searches that found nothing, in image time; ``last_s`` : the last pause, 0 = there was none."""
+
+    def __init__(self) -> None:
+        self._until_ns, self.last_s = 0, 0.0
+
+    def due(self, stamp_ns: int) -> bool:
+        """Whether the window whose newest image has this stamp is searched."""
+        return stamp_ns >= self._until_ns
+
+    def failed(self, stamp_ns: int) -> None:
+        """The search in the window of this stamp found nothing."""
+        self.last_s = min(2.0 * self.last_s, _LONGEST_PAUSE_S) or _FIRST_PAUSE_S
+        self._until_ns = stamp_ns + round(self.last_s * 1e9)
 
 
 class TelemetryUse(Enum):

@@ -40,12 +40,16 @@ _LEAST_S = 2.0
 
 
 class WorldWindows:
-    """Adjusts one window after the other; what was found out is forgotten with the subject."""
+    """Adjusts one window after the other.
+
+    What the body found is forgotten with the subject, what fixed points found with the pass of time.
+    """
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
         self._config = world_config(config)
         self._length_ns = round(config.world_window_s * 1e9)
         self._subject: int | None = None
+        self._newest_ns = 0
         self._chain, self._fused = WorldChain(), FusedCamera()
         self._moved = self._by_points = False
         #: Whether the last window's telemetry was true: the lifter may see the camera's rotation.
@@ -61,7 +65,11 @@ class WorldWindows:
         camera_result : its result in camera axes
         """
         if w.subject != self._subject:
-            self._subject, self._chain, self._fused = w.subject, WorldChain(), FusedCamera()
+            self._subject, self._chain = w.subject, WorldChain()
+        newest_ns = int(w.stamp_ns[-1])
+        if newest_ns < self._newest_ns:
+            self._fused = FusedCamera()
+        self._newest_ns = newest_ns
         result = self._adjust(w, found, camera_result)
         self.trusted = result.telemetry in (TelemetryUse.USED, TelemetryUse.UNSCALED)
         return result

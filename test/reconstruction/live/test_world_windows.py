@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.rotations import exp_so3, log_so3, quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
@@ -253,6 +256,31 @@ def test_fixed_points_measure_the_reports_and_correct_them_from_window_to_window
 
     after = [w.window for w in windows_of(run(true.observations, camera_at, SELDOM, until))]
     assert {w.telemetry for w in after if w.stamp_ns[-1] > dark_ns} == {TelemetryUse.USED}
+
+
+def test_reports_of_another_flight_are_refused_by_the_points_and_seldom_asked_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    true, asked = flown(), list[int]()
+
+    def counted(tracks: Tracks, *rest: Any) -> FusedTelemetry | Refusal | None:
+        asked.append(int(tracks.stamp_ns[-1]))
+        return fuse_telemetry(tracks, *rest)
+
+    monkeypatch.setattr("drocap_ros.reconstruction.live.fused_camera.fuse_telemetry", counted)
+    other = replace(true, rotation=true.rotation[::-1], position=true.position[::-1])
+    # The second subject has the same vehicle: nothing is asked anew.
+    half = len(true.observations) // 2
+    stream = [replace(o, track_id=1 + (i >= half)) for i, o in enumerate(true.observations)]
+    windows = [w.window for w in windows_of(run(stream, other.history(keep_s=60.0).along, points_at=true.points_at))]
+    told = [w for w in windows if w.telemetry is not TelemetryUse.LATE]
+    assert {w.telemetry for w in told} == {TelemetryUse.REFUSED}
+    assert "turn otherwise" in told[0].reason
+    assert told[0].reason.endswith("asked again after 4 s")
+    assert told[-1].reason.endswith("asked again after 8 s")
+    pauses = np.diff(asked) / S
+    assert len(told) > 2 * len(asked)
+    assert (pauses >= [4.0, 8.0][: len(pauses)]).all()
 
 
 def test_another_subject_starts_without_the_findings_of_the_first() -> None:
