@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import logging
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,7 +14,6 @@ from pathlib import Path
 from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
-from drocap_ros.live_replay import replay
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import open_images, refuse_other_inputs
@@ -23,8 +24,6 @@ from drocap_ros.perception.persons import FoundPerson, find_persons, following, 
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.reconstruction.reconstruct import SolvedView, reconstruct, solve_view
-from drocap_ros.reconstruction.together.joined import join_views
 from drocap_ros.recording.evidence import with_evidence
 from drocap_ros.recording.image_messages import choose_images
 from drocap_ros.recording.open_session import is_recording, open_session
@@ -106,9 +105,11 @@ def reconstruct_input(
             raise InputError("--method live: expected a whole recording with its recorded poses; choose another method")
         if telemetry != _FOUND:
             raise InputError("--method live: expected the recorded telemetry, got other; leave the options out")
+        from drocap_ros.live_replay import replay
+
         return replay(Path(path), config, progress)
     begin = time.perf_counter()
-    tracks, origin = _with_own_camera(Path(path), config, models, progress, telemetry, selection)
+    tracks, origin = input_tracks(Path(path), config, models, progress, telemetry, selection)
     if selection.evidence is not None:
         tracks = with_evidence(tracks, selection.evidence)
     if selection.rate_hz:
@@ -116,13 +117,15 @@ def reconstruct_input(
     seconds = time.perf_counter() - begin
     if selection.on_tracks is not None:
         selection.on_tracks(tracks, origin)
+    from drocap_ros.reconstruction.reconstruct import reconstruct
+
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
     return with_origin(motion, Path(path), origin, seconds), tracks
 
 
-def _with_own_camera(
+def input_tracks(
     path: Path,
     config: DrocapConfig,
     models: Path | None,
@@ -145,47 +148,6 @@ def with_origin(motion: Motion, path: Path, origin: Values, seconds: float) -> M
     stages = {"pose2d": seconds, **meta.get("seconds", {})}
     meta["seconds"] = {**stages, "total": seconds + stages.get("total", 0.0)}
     return dataclasses.replace(motion, meta=meta)
-
-
-def reconstruct_together(
-    paths: list[Path],
-    *,
-    config: DrocapConfig,
-    models: Path | None = None,
-    progress: Progress | None = None,
-    telemetry: Telemetry = _FOUND,
-    threads: int = 0,
-) -> list[tuple[Motion, Tracks]]:
-    """The one motion that several recordings of a person show, as each recording's camera sees it, and their tracks.
-
-    Parameters
-    ----------
-    paths : inputs of :func:`reconstruct_input`, two at least; the times of the first one's images are those of all
-    telemetry : none, or that which the recordings have with them
-
-    Raises
-    ------
-    InputError
-        When an input cannot be used, or two do not show the same motion.
-    """
-    solved: list[SolvedView] = []
-    read: list[tuple[Path, Values, float]] = []
-    tracks: list[Tracks] = []
-    for path in paths:
-        begin = time.perf_counter()
-        own, origin = _with_own_camera(path, config, models, progress, telemetry, Selection(threads=threads))
-        read.append((path, origin, time.perf_counter() - begin))
-        tracks.append(own)
-        solved.append(
-            solve_view(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress)
-        )
-    begin = time.perf_counter()
-    motions = join_views(solved, [path.name for path in paths], config.bundle_adjuster.threads)
-    took = time.perf_counter() - begin
-    for motion in motions:
-        alone = motion.meta["seconds"]
-        motion.meta["seconds"] = {**alone, "together": took, "total": alone["total"] + took}
-    return [(with_origin(motion, *of), own) for motion, of, own in zip(motions, read, tracks, strict=True)]
 
 
 def needs_networks(path: Path, redetect: bool) -> bool:
@@ -309,6 +271,8 @@ def follow_selected(
 def _track(
     path: Path, config: DrocapConfig, models: Path | None, progress: Progress | None, selection: Selection
 ) -> tuple[Tracks, Values]:
+    if selection.threads > 1:
+        threading.Thread(target=_import_reconstruction).start()
     # Offline the most frequent subject of the whole recording is chosen at the end.
     config = config.replace("pose_estimator", on_loss="next")
     folder, clip = models_folder(models or config.pose_estimator.models_dir), selection.clip
@@ -340,6 +304,12 @@ def _track(
         text = "%s: several persons, %s is reconstructed; `drocap track %s --list` numbers them for --subject N"
         logger.warning(text, path, chosen, path)
     return tracks, origin
+
+
+def _import_reconstruction() -> None:
+    """Import what works on boxes and tracks: 0.4 s (measured), in which the networks see their first images."""
+    for name in ("scipy.optimize", "drocap_ros.reconstruction.reconstruct"):  # one thread alone imports scipy
+        importlib.import_module(name)
 
 
 def _log_warnings(session: Session) -> None:
