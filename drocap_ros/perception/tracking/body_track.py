@@ -37,16 +37,18 @@ class BodyTrack:
         self.speed = np.zeros_like(self.xy)  # px/s
         self.joints_ns = np.full(len(joints), stamp_ns)
         self.colours: np.ndarray = np.full((len(joints), 3), np.nan)
-        self.length = max(float((person.box[2:] - person.box[:2]).max()), 1.0)
+        box = self.box  # a detection may be around two persons
+        self.length = max(float((box[2:] - box[:2]).max()), 1.0)
         names = [name.lstrip("lr") for name in joints.joints]
         self._per_s = np.array([_ERROR_PER_S.get(name, _TRUNK_PER_S) for name in names])
 
     def predict(self, stamp_ns: int) -> None:
-        """Expect the joints at a later time."""
+        """Expect the joints at a later time; a long gap between images is a time without measurement, too."""
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        self.xy += dt * self.speed
+        left = np.exp(-dt / _DECAY_S)
+        self.xy += _DECAY_S * (1.0 - left) * self.speed
         unseen = (stamp_ns - self.joints_ns) * 1e-9 > 2 * dt
-        self.speed[unseen] *= np.exp(-dt / _DECAY_S)
+        self.speed[unseen] *= left
         self.stamp_ns = stamp_ns
 
     def move_camera(self, matrix: np.ndarray) -> None:

@@ -84,6 +84,27 @@ def test_wrist_on_another_body_is_dropped() -> None:
     assert (np.delete(owned.joint[0], wrist) >= 0).sum() >= 12
 
 
+def test_one_gap_is_as_long_as_many_images_without_the_person() -> None:
+    """A busy machine leaves images out: the last speed is believed no longer than where the images show nobody."""
+    left_out, hidden = tracks_up_to(10, (0, 0))
+    for ns in range(40, 1001, 40):
+        hidden.predict(int(TIMES[10]) + 1_000_000 * ns)
+    left_out.predict(hidden.stamp_ns)
+    apart = np.linalg.norm(left_out.xy - hidden.xy, axis=1)
+    assert (apart < 0.15 * np.linalg.norm(hidden.xy - tracks_up_to(10, (0,))[0].xy, axis=1)).all()
+
+
+def test_length_is_that_of_the_joints_in_a_box_around_two_persons() -> None:
+    both = np.concatenate([TRUTH[0][0], TRUTH[1][0]])
+    one, two = (np.concatenate([xy.min(axis=0), xy.max(axis=0)]) for xy in (TRUTH[0][0], both))
+    assert np.ptp(two.reshape(2, 2), axis=0).max() > 1.5 * np.ptp(one.reshape(2, 2), axis=0).max()
+    alone, merged = (
+        BodyTrack(Person(box, 0.8, int(TIMES[0]), None), pose_of(TRUTH[0][0]), BODY_15, int(TIMES[0])).length
+        for box in (one, two)
+    )
+    assert merged == alone
+
+
 def test_images_before_and_after_show_a_borrowed_joint() -> None:
     frame = nearest(0, 1)
     ankle = BODY_15.index("rankle")
