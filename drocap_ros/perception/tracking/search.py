@@ -45,6 +45,8 @@ class SubjectSearch:
         self._full_ns: int | None = None  # last detection over the whole image
         self._tile = self._turn = 0
         self._alternate = False
+        #: Whether the last image needed a second pass.
+        self._unclear = False
         #: The next image, and detections in windows of it that another thread makes.
         self._begun: tuple[np.ndarray, dict[Window | None, Future[Detections]]] | None = None
 
@@ -59,9 +61,12 @@ class SubjectSearch:
         found = reduce(_merged, [self._detect_in(image, window, shedding) for window in windows])
         if shedding or (subject := self._tracker.followed(stamp_ns)) is None:
             return found
-        for further in (self._second_pass_window, self.sought_window):
-            if (window := further(subject, found, size, stamp_ns)) is not None:
-                found = _merged(found, self._detect_in(image, window, False))
+        tight = self._second_pass_window(subject, found, size, stamp_ns)
+        if tight is not None:
+            found = _merged(found, self._detect_in(image, tight, False))
+        self._unclear = tight is not None
+        if (window := self.sought_window(subject, found, size, stamp_ns)) is not None:
+            found = _merged(found, self._detect_in(image, window, False))
         return found
 
     def begin(self, image: np.ndarray, stamp_ns: int, beside: Executor) -> None:
@@ -71,9 +76,12 @@ class SubjectSearch:
         """
         subject = self._tracker.followed(stamp_ns)
         size = (image.shape[1], image.shape[0])
-        near = None if subject is None else window_around(subject.filter.box_at(stamp_ns), size, WIDE)
-        windows = {near, None} if self._full_image_due(stamp_ns) else {near}
-        self._begun = image, {window: beside.submit(self._found_in, image, window, False) for window in windows}
+        windows: list[Window | None] = [None] if subject is None or self._full_image_due(stamp_ns) else []
+        if subject is not None:
+            box = subject.filter.box_at(stamp_ns)
+            windows[:0] = [window_around(box, size, extent) for extent in (WIDE, TIGHT)[: 1 + self._unclear]]
+        begun = {window: beside.submit(self._found_in, image, window, False) for window in dict.fromkeys(windows)}
+        self._begun = image, begun
 
     def isolated(self, predicted: np.ndarray, image_size: tuple[int, int], stamp_ns: int) -> bool:
         """Whether a subject at this box (4,) px is away from others and from the edges, and no full image is due."""
