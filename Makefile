@@ -14,19 +14,22 @@ TEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
 SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py pyproject.toml CMakeLists.txt package.xml
 
-.PHONY: help setup demo test test-nodes test-computing lint site release bench bench-quick bench-flight clean
+.PHONY: help setup demo test compiled test-nodes test-computing lint site release bench bench-quick bench-flight clean
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
 setup: $(VENV)/.package  ## virtual environment with ROS 2 Jazzy (`make ROS=kilted`: Kilted) and this package
 
+# The lock names every package: one pip installs the half of them, which takes one core half a minute.
 $(VENV)/.requirements: requirements.lock $(wildcard requirements-$(ROS).lock)
 	@mkdir -p build
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 13) else f"make setup: expected Python 3.10 to 3.13, found {v[0]}.{v[1]}; run: make PYTHON=python3.11 ...")'
 	@echo "setup: virtual environment, ROS 2 $(ROS) and dependencies from PyPI (about a minute)"
 	@{ [ $(ROS) = jazzy ] && cat requirements.lock || { grep -v '^ros-' requirements.lock; cat requirements-$(ROS).lock; }; } > build/requirements.txt
 	@$(CLEAN) $(PYTHON) -m venv $(VENV)
-	@$(CLEAN) $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r build/requirements.txt
+	@awk '{ print > ("build/requirements." NR % 2) }' build/requirements.txt
+	@printf 'build/requirements.%d\n' 0 1 | $(CLEAN) xargs -P 2 -n 1 $(BIN)/python -m pip install --quiet --no-compile --no-deps --disable-pip-version-check -r
+	@$(CLEAN) $(BIN)/python -m pip check --disable-pip-version-check > build/requirements.log || { cat build/requirements.log; exit 1; }
 	@touch $@
 
 # The ROS wheels on PyPI lack tf2_msgs (TF) and hri_msgs (REP 155).
@@ -49,6 +52,10 @@ demo: setup  ## a whole simulated capture, reconstructed and compared with its t
 # the processors beside them.  Their outcome is printed when they end.
 test: setup  ## the whole test suite: nodes and clocks (up to three times), and beside them what only computes
 	@$(MAKE) --no-print-directory -j2 test-nodes test-computing
+
+# Workers that start at once would compile the same modules, each for itself.
+compiled: setup  ## bytecode of what the tests import, for the first `make test` of a clone
+	@$(CLEAN) $(BIN)/python -m pytest --collect-only -m "not clock and not counting" > build/collected.log || { cat build/collected.log; exit 1; }
 
 test-nodes: setup
 	$(CLEAN) $(TEST) -m clock -n 3 --reruns 2 --rerun-show-tracebacks -r sR
