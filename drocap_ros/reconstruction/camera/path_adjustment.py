@@ -25,8 +25,6 @@ _NEARNESS = (0.03, 2.0)
 _HORIZON = 0.26
 #: Most dampings that are tried for one step.
 _TRIALS = 8
-#: Steps of the rest of each frame, with the points held.
-_REST_STEPS = 2
 #: Points in a frame below which its camera is the neighbours' alone.
 ENOUGH_POINTS = 8
 
@@ -146,9 +144,9 @@ def _improved(here: PathResiduals, damping: float) -> tuple[PathResiduals | None
 
 def with_points(r: PathResiduals) -> PathResiduals:
     """Residuals after a step of the points alone, where it lowers their cost."""
-    image, by_point, _ = r.image_derivatives
+    by_point = r.by_point
     own = r.data.views.of_pieces(np.swapaxes(by_point, 1, 2) @ by_point) + POINT_WEIGHT * np.eye(3)
-    pull = r.data.views.of_pieces(np.einsum("nk,nki->ni", image, by_point))
+    pull = r.data.views.of_pieces(np.einsum("nk,nki->ni", r.weighted, by_point))
     there = r.moved(np.zeros_like(r.state.errors), np.zeros(SHARED), -np.linalg.solve(own, pull[..., None])[..., 0])
     lower = r.data.views.of_pieces(there.square * there.robust - r.square * r.robust) < 0.0
     points = np.where(lower[:, None], there.state.points, r.state.points)
@@ -156,22 +154,19 @@ def with_points(r: PathResiduals) -> PathResiduals:
 
 
 def with_rest(r: PathResiduals) -> PathResiduals:
-    """Residuals after the rest of each frame has been found, with the points where they are."""
+    """Residuals after a step of the rest of each frame, with the points where they are: a second one tells no more."""
     data, config = r.data, r.data.config
     expected = np.repeat([config.jitter_m, np.deg2rad(config.jitter_deg)], 3) ** -2.0
     frames, views = data.path.frames, data.views
-    for _ in range(_REST_STEPS):
-        image, _, camera = r.image_derivatives
-        order, place = views.by_frame
-        by_view = np.zeros((frames, int(place.max(initial=0)) + 1, 2, KNOT + 1))
-        by_view[views.frame[order], place, :, :KNOT] = camera[order][..., :KNOT]
-        by_view[views.frame[order], place, :, KNOT] = image[order]
-        rows = by_view.reshape(frames, -1, KNOT + 1)
-        own = np.swapaxes(rows, 1, 2) @ rows
-        right = own[:, :KNOT, KNOT] + expected * r.state.rest
-        step = np.linalg.solve(own[:, :KNOT, :KNOT] + np.diag(expected), -right[..., None])[..., 0]
-        r = PathResiduals(data, r.weights, replace(r.state, rest=r.state.rest + step), r.outlier)
-    return r
+    order, place = views.by_frame
+    by_view = np.zeros((frames, int(place.max(initial=0)) + 1, 2, KNOT + 1))
+    by_view[views.frame[order], place, :, :KNOT] = r.by_camera[order][..., :KNOT]
+    by_view[views.frame[order], place, :, KNOT] = r.weighted[order]
+    rows = by_view.reshape(frames, -1, KNOT + 1)
+    own = np.swapaxes(rows, 1, 2) @ rows
+    right = own[:, :KNOT, KNOT] + expected * r.state.rest
+    step = np.linalg.solve(own[:, :KNOT, :KNOT] + np.diag(expected), -right[..., None])[..., 0]
+    return PathResiduals(data, r.weights, replace(r.state, rest=r.state.rest + step), r.outlier)
 
 
 def _solution(r: PathResiduals, found: Posterior | None, iterations: int, stop_reason: str) -> AdjustedPath:

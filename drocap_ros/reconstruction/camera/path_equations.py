@@ -53,7 +53,7 @@ class PathEquations:
         """The part of the camera alone, summed over each frame and shared among the knots beside it."""
         r = self._residuals
         views, knots, frames = r.data.views, r.data.knots, r.data.path.frames
-        camera = r.image_derivatives[2]
+        camera = r.by_camera
         order, place = views.by_frame
         by_view = np.zeros((frames, int(place.max(initial=0)) + 1, 2, camera.shape[2]))
         by_view[views.frame[order], place] = camera[order]
@@ -104,7 +104,7 @@ class PathEquations:
         """Subtract what the points explain; pieces that begin at one knot have one dense block."""
         r = self._residuals
         views, knots = r.data.views, r.data.knots
-        _, by_point, by_camera = r.image_derivatives
+        by_point, by_camera = r.by_point, r.by_camera
         own = by_point[:, 0, :, None] * by_point[:, 0, None] + by_point[:, 1, :, None] * by_point[:, 1, None]
         both = by_point[:, 0, :, None] * by_camera[:, 0, None] + by_point[:, 1, :, None] * by_camera[:, 1, None]
         inverse = np.linalg.inv(np.linalg.cholesky(views.of_pieces(own) + POINT_WEIGHT * np.eye(3)))

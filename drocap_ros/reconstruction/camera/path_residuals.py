@@ -138,6 +138,7 @@ class PathResiduals:
         self.image = self.focal * self.slope + data.matrix[:2, 2] - views.point
         self.square = np.square(self.image).sum(axis=1) / data.config.noise_px**2
         self.robust = 1.0 / (1.0 + self.square / self.outlier)
+        self._root = self.robust / data.config.noise_px
 
     def _compare_path(self) -> None:
         """Errors with those at the knot before, and the path with a steady flight."""
@@ -152,53 +153,66 @@ class PathResiduals:
 
     def with_outlier(self, outlier: float) -> PathResiduals:
         """Residuals at the same point with another square at which a point has half its weight."""
-        return PathResiduals(self.data, self.weights, self.state, outlier)
+        return self if outlier == self.outlier else PathResiduals(self.data, self.weights, self.state, outlier)
 
     def usual_outlier(self) -> float:
         """Squared residual that sets outliers apart from the rest: far from the solution all are large."""
         return max(OUTLIER_SQUARE, _OVER_MEDIAN * float(np.median(self.square))) if len(self.square) else OUTLIER_SQUARE
 
     @cached_property
-    def image_derivatives(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residuals (N, 2) at the present robust weight, and their derivatives by points and by camera.
+    def _by_place(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives (N, 2, 3) of the residuals by the places of points before the camera, and what they consist of.
 
-        By the point (N, 2, 3), and by the camera (N, 2, KNOT + U): a frame's error, and the U free shared unknowns.
+        That is the slope (N, 2) of the rays, and the size (N, 2) of the residuals over a slope and a depth.
         """
-        data, state, views = self.data, self.state, self.data.views
-        frame, root = views.frame, self.robust / data.config.noise_px
-        near = self.seen[:, 2] > _NEAREST
-        slope = np.where(near[:, None], self.slope, 0.0)
-        per_unit = (root / self.depth)[:, None] * self.focal
-        rotation = self.rotation[frame]
-        by_place = per_unit[..., None] * (rotation[:, :2] - slope[..., None] * rotation[:, 2:])
+        slope = np.where(self.seen[:, 2:] > _NEAREST, self.slope, 0.0)
+        per_unit = (self._root / self.depth)[:, None] * self.focal
+        rotation = self.rotation[self.data.views.frame]
+        return per_unit[..., None] * (rotation[:, :2] - slope[..., None] * rotation[:, 2:]), slope, per_unit
+
+    @cached_property
+    def weighted(self) -> np.ndarray:
+        """Residuals (N, 2) at the present robust weight."""
+        return np.asarray(self._root[:, None] * self.image)
+
+    @cached_property
+    def by_point(self) -> np.ndarray:
+        """Their derivatives (N, 2, 3) by the points."""
+        state, views, (by_place, _, _) = self.state, self.data.views, self._by_place
+        across = tangents(state.points)[views.piece]
+        towards = -np.einsum("nki,ni->nk", by_place, (self.position / state.unit)[views.frame])
+        return np.asarray(by_place @ across[:, :3] + towards[..., None] * across[:, 3][:, None])
+
+    @cached_property
+    def by_camera(self) -> np.ndarray:
+        """Their derivatives (N, 2, KNOT + U) by a frame's error and the U free shared unknowns."""
+        state, frame, (by_place, slope, per_unit) = self.state, self.data.views.frame, self._by_place
+        free = np.flatnonzero(self.weights.free).tolist()
+        out = np.empty((len(frame), 2, KNOT + len(free)))
         x, y, z = self.seen.T
         by_turn = np.empty(by_place.shape)
         by_turn[:, 0, 0], by_turn[:, 1, 0] = -slope[:, 0] * y, -z - slope[:, 1] * y
         by_turn[:, 0, 1], by_turn[:, 1, 1] = z + slope[:, 0] * x, slope[:, 1] * x
         by_turn[:, 0, 2], by_turn[:, 1, 2] = -y, x
         by_turn *= per_unit[..., None]
-        at = state.points[views.piece]
-        by_position = by_place * (-at[:, 3] / state.unit)[:, None, None]
-        lever = by_place @ tangents(state.points)[views.piece][:, :3]
-        towards = -np.einsum("nki,ni->nk", by_place, (self.position / state.unit)[frame])
-        by_point = lever + towards[..., None] * tangents(state.points)[views.piece][:, 3][:, None]
-        of_error = np.concatenate([by_position, by_turn @ left_jacobian(self.turn)[frame]], axis=2)
-        of_shared = {
-            ATTITUDE_LATENCY: lambda: np.einsum("nki,ni->nk", by_turn, self.turn_rate[frame]),
-            POSITION_LATENCY: lambda: np.einsum("nki,ni->nk", by_position, self.velocity[frame]),
-            FOCAL: lambda: root[:, None] * self.focal * self.slope,
-        }
-        free = np.flatnonzero(self.weights.free).tolist()
-        columns = [of_shared[i]() if i in of_shared else of_error[..., 3 + i] for i in free]
-        camera = np.concatenate([of_error, *(column[..., None] for column in columns)], axis=2)
-        return root[:, None] * self.image, by_point, camera
+        out[..., :3] = by_place * (-state.points[self.data.views.piece, 3] / state.unit)[:, None, None]
+        out[..., 3:KNOT] = by_turn @ left_jacobian(self.turn)[frame]
+        for column, unknown in enumerate(free, KNOT):
+            if unknown == ATTITUDE_LATENCY:
+                out[..., column] = np.einsum("nki,ni->nk", by_turn, self.turn_rate[frame])
+            elif unknown == POSITION_LATENCY:
+                out[..., column] = np.einsum("nki,ni->nk", out[..., :3], self.velocity[frame])
+            elif unknown == FOCAL:
+                out[..., column] = self._root[:, None] * self.focal * self.slope
+            else:
+                out[..., column] = out[..., 3 + unknown]
+        return out
 
 
 def gradient(r: PathResiduals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives of the cost by the knots' errors (K, 6), the shared unknowns (SHARED,) and the points (J, 3)."""
     data, state, weights = r.data, r.state, r.weights
-    image, by_point, by_camera = r.image_derivatives
-    pull = np.einsum("nk,nki->ni", image, by_camera)
+    pull = np.einsum("nk,nki->ni", r.weighted, r.by_camera)
     of_frame = np.stack(
         [np.bincount(data.views.frame, pull[:, i], minlength=data.path.frames) for i in range(KNOT)], axis=1
     )
@@ -213,7 +227,7 @@ def gradient(r: PathResiduals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     errors[:-2, :3] += swing
     shared = weights.shared @ state.shared
     shared[weights.free] += pull[:, KNOT:].sum(axis=0)
-    return errors, shared, data.views.of_pieces(np.einsum("nk,nki->ni", image, by_point))
+    return errors, shared, data.views.of_pieces(np.einsum("nk,nki->ni", r.weighted, r.by_point))
 
 
 def knots_of_frames(r: PathResiduals, values: np.ndarray) -> np.ndarray:

@@ -87,7 +87,7 @@ def test_step_solves_the_normal_equations_of_all_unknowns() -> None:
     r = residuals(rng, data)
     step = PathEquations(r).step()
     assert step is not None
-    image, by_point, by_camera = r.image_derivatives
+    image, by_point, by_camera = r.weighted, r.by_point, r.by_camera
     knots, views = data.knots, data.views
     used = KNOT * knots.count
     rows = np.zeros((len(image), 2, used + SHARED + 3 * len(views.track)))
