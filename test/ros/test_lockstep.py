@@ -4,7 +4,10 @@ import time
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 
 from drocap_ros.bringup import lockstep
 from drocap_ros.config import DrocapConfig
@@ -45,6 +48,30 @@ def test_timers_run_at_their_instants_of_the_simulated_time_in_the_order_of_the_
     # Timers were due when the time began.
     at = [10_000_000, S, 2 * S, 3 * S]
     assert seen == [(t, f"drocap/{name}", "running") for t in at for name in ("initializer", "visualizer")]
+
+
+def test_a_viewer_that_joins_hears_what_is_published_from_then_on(graph):
+    own, carried = diagnostics(graph), []
+    publisher = next(p for _, p in graph.components[0].outputs if p.topic_name == "/diagnostics")
+    publish = publisher.publish
+    publisher.publish = lambda message: (carried.append(message), publish(message))
+    graph.start()
+    carried.clear()
+    graph.run_for(2.0)
+    assert len(own) > 2
+    assert not carried  # the nodes hear each other without the middleware
+    heard = {"/diagnostics": [], "/clock": []}
+    viewer = Node("viewer", context=graph.node.context)
+    viewer.create_subscription(DiagnosticArray, "/diagnostics", heard["/diagnostics"].append, 10)
+    viewer.create_subscription(Clock, "/clock", heard["/clock"].append, 10)
+    executor = SingleThreadedExecutor(context=graph.node.context)
+    executor.add_node(viewer)
+    end_s = time.monotonic() + 30.0
+    while not all(heard.values()) and time.monotonic() < end_s:
+        graph.run_for(0.1)
+        executor.spin_once(0.05)
+    viewer.destroy_node()
+    assert all(heard.values())
 
 
 def test_wait_is_bounded_in_simulated_time(graph):
