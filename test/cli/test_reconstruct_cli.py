@@ -91,6 +91,8 @@ def test_the_knees_of_outdoor_walk_bend_as_the_legs_shorten_in_the_image(outdoor
 def test_squats_agree_with_another_system(shared, tmp_path):
     motion = reconstructed(shared / "media" / "pose_squats.mp4", tmp_path, "--models", shared / "models")
     assert np.isfinite(motion.keypoints).all(axis=2).any(axis=1).mean() >= 0.95
+    # The report shows the pictures of the video.
+    assert (tmp_path / "out" / "report.html").read_text().count('"/9j/') == 65
     landmarks = json.loads((shared / "media" / "pose_squats_landmarks3d.json").read_text())
     other = np.array(landmarks, float)[: len(motion.joints3d), BLAZEPOSE, :3]
     ours = motion.joints3d[:, indices(motion.joints, LIMB_JOINTS)]

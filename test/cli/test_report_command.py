@@ -160,10 +160,3 @@ def test_a_second_reconstruction_keeps_the_images_of_the_report(tmp_path):
     assert len(pictures) == 15
     assert main(command) == 0
     assert images_in(out / "report.html") == pictures
-
-
-def test_reconstruct_shows_the_pictures_of_its_video(shared, tmp_path):
-    video = shared / "media" / "pose_squats.mp4"
-    command = ["reconstruct", str(video), "--models", str(shared / "models"), "--out", str(tmp_path / "out"), "--quiet"]
-    assert main(command) == 0
-    assert (tmp_path / "out" / "report.html").read_text().count('"/9j/') == 65

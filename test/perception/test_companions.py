@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -26,7 +27,8 @@ SCALE = 0.5
 Shown = list[dict[int, PoseObservation]]
 
 
-def frames(who: Sequence[int] = (0, 1, 2)) -> list[Frame]:
+@lru_cache
+def frames(who: tuple[int, ...] = (0, 1, 2)) -> list[Frame]:
     def small(image: np.ndarray) -> np.ndarray:
         return cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA)
 
@@ -99,7 +101,7 @@ def test_who_leaves_frees_the_place_and_a_number_is_never_given_twice(three: Sho
     own = keypoints(three, 1001)
     truth = [SCALE * camera_of(SCENE).pixels(person) for person in people_of(SCENE)]
     gone = int(np.argmin([np.nanmedian(np.linalg.norm(own - person, axis=2)) for person in truth]))
-    whole, without = frames(), frames([k for k in range(3) if k != gone])
+    whole, without = frames(), frames(tuple(k for k in range(3) if k != gone))
     companions = Companions(MODELS, CONFIG, itertools.count(1001))
     first = followed(whole[:15] + without[15:], companions)
     assert {o.track_id for o in first[14].values()} == {1, 1001, 1002}
