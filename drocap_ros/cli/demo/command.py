@@ -159,15 +159,16 @@ def with_link(config: DrocapConfig) -> DrocapConfig:
 def _reconstruct(folder: Path, config: DrocapConfig, args: argparse.Namespace) -> Motion:
     """Motion of the recorded session, saved with its images and report."""
     from drocap_ros.motion import save_motion
-    from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.pipeline import Selection, reconstruct_input
+    from drocap_ros.report.motion_images import ImagesBeside
     from drocap_ros.report.page import save_report
 
-    with progress_bars(args.quiet) as progress:
-        motion, _ = reconstruct_input(folder / "session", method="ba", config=config, progress=progress)
+    session = folder / "session"
+    with progress_bars(args.quiet) as progress, ImagesBeside(session, progress) as images:
+        selection = Selection(on_tracks=images.begin)
+        motion, _ = reconstruct_input(session, method="ba", config=config, progress=progress, selection=selection)
         save_motion(folder / "motion.npz", motion)
-        progress("report", -1.0)
-        save_report(folder / "report.html", motion, video=folder / "session", command=args.command_line)
-        progress("report", 1.0)
+        save_report(folder / "report.html", motion, images=images.of(motion), command=args.command_line)
     return motion
 
 
