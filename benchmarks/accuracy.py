@@ -12,6 +12,8 @@ telemetry    the motion in the world by telemetry that errs (`drocap evaluate wo
 together     two cameras 120 degrees apart whose times and places nobody knows (`drocap reconstruct A B --together`),
              every third sequence: page accuracy_together
 planned      flights by a plan against steady orbits of equal length: page accuracy_planned
+colmap       turns of the camera from the picture alone against COLMAP's on the same drone videos, which needs
+             `pip install pycolmap` and an hour: page accuracy_colmap
 real         phone videos with optical MoCap (``--models DIR`` of the 2D networks): page accuracy_real
 calibration  gimbal yaw and latency found from telemetry that errs, an orbit that reverses once, `--runs` flights: page
              accuracy_calibration
@@ -31,6 +33,7 @@ from figures import ROOT, table, write_figures
 
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.config import DrocapConfig
+from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
 from drocap_ros.evaluation.protocol import (
     FPS,
@@ -51,6 +54,7 @@ from drocap_ros.simulation.orbit_camera import project, to_camera
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
 from drocap_ros.tracks import Tracks
 from lab.studies.calibration import calibration_markdown, calibration_study
+from lab.studies.colmap_camera import colmap_markdown, colmap_study
 from lab.studies.live_study import live_study
 from lab.studies.live_study_table import live_markdown
 from lab.studies.live_world import live_world_markdown, live_world_study
@@ -247,10 +251,17 @@ def real(args: argparse.Namespace) -> None:
     write_figures("accuracy_real", "Real people with optical MoCap", text + table(head, list(rows.values())))
 
 
+def colmap(args: argparse.Namespace) -> None:
+    """The camera without telemetry against COLMAP's; of the drone videos beside the MoCap."""
+    models = args.models or ROOT.parent / "shared" / "models"
+    clips = sorted((args.mocap.parents[1] / "aerial").glob("*.mp4"))
+    write_figures("accuracy_colmap", "The camera by the picture alone", colmap_markdown(colmap_study(clips, models)))
+
+
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective, "near": near,
     "world": world, "telemetry": telemetry, "together": together, "calibration": calibration,
-    "real": real,
+    "real": real, "colmap": colmap,
     "planned": planned,
 }  # fmt: skip
 
@@ -270,7 +281,10 @@ def main() -> int:
         if part != "world" and not args.mocap.is_dir():
             print(f"accuracy: no {args.mocap.name} beside the checkout, {part} is left out")
             continue
-        PARTS[part](args)
+        try:
+            PARTS[part](args)
+        except InputError as error:
+            print(f"accuracy: {error}, {part} is left out")
     return 0
 
 

@@ -83,7 +83,9 @@ class Growth:
     def grow(self, most: int) -> Grown:
         """Place keyframes on both sides until ``most`` are known or no more can be placed; adjust now and then."""
         due = _FIRST_KEYS
-        while int(self.path.known.sum()) < most and (self.extend() or self._on_ground()):
+        while int(self.path.known.sum()) < most and (
+            (self._hovers() and self._on_ground()) or self.extend() or self._on_ground()
+        ):
             if self.path.known.sum() >= due:
                 self.adjust()
                 due = int(_GROWTH * self.path.known.sum())
@@ -96,13 +98,22 @@ class Growth:
         placed = [self._place(key) for key in self._next_keys()]
         return any(placed)
 
+    @property
+    def _flat(self) -> np.ndarray:
+        """(J,) points whose rays show no depth."""
+        return np.asarray(np.linalg.norm(self._ray - self._first, axis=1) < _LITTLE_PARALLAX)
+
+    def _hovers(self) -> bool:
+        """Whether most points that place the next keyframes have no depth: each place would lean on the last one's."""
+        seen = [piece[usable] for usable, piece, _ in map(self._matches, self._next_keys())]
+        return bool(seen) and bool(self._flat[np.concatenate(seen)].mean() > 0.5)
+
     def _on_ground(self) -> bool:
         """Place the next keyframes by points that are taken to lie on the ground; whether any could be placed.
 
         A camera that hovers sees points without depth, and a path ends there; most of what it sees is ground.
         """
-        known = self.path.known
-        flat = np.linalg.norm(self._ray - self._first, axis=1) < _LITTLE_PARALLAX
+        known, flat = self.path.known, self._flat
         up = -self.path.rotation[known, 1].mean(axis=0)
         ground = largest_plane(self.places[self.usable & ~flat], self.path.position[known], up, _TILTED_DEG)
         if ground is None:

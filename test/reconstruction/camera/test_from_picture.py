@@ -69,7 +69,8 @@ def test_camera_that_follows_slowly_is_found_without_parallax_to_begin_with() ->
     assert shape_error(found.position, scene.position) < 0.05
 
 
-def test_path_goes_on_over_the_ground_where_a_camera_hovers() -> None:
+@pytest.mark.parametrize("seed", [6, 9, 15])
+def test_path_goes_on_over_the_ground_where_a_camera_hovers(seed: int) -> None:
     position = np.concatenate([np.zeros((54, 3)), orbit(FRAMES, FPS)[1]])
     sway = 2 * np.pi * np.arange(30) / 30
     position[:, 2] = 2.5
@@ -78,11 +79,11 @@ def test_path_goes_on_over_the_ground_where_a_camera_hovers() -> None:
     position[24:54, :2] += 0.05 * np.stack([np.sin(2 * sway), np.sin(sway)], axis=1)
     rotation = looking(position, np.tile([0.0, 0.0, 0.9], (len(position), 1)))
     # Few points, and none that is seen before and after the pause.
-    scene = seen(rotation, position, points_of(np.random.default_rng(6), 400, flat=True), FPS, longest_s=1.5)
+    scene = seen(rotation, position, points_of(np.random.default_rng(seed), 400, flat=True), FPS, longest_s=1.5)
     found = camera_of(scene, noise_px=0.3)
     assert found.kind is Kind.MOVES
     assert found.covered > 0.95
-    assert shape_error(found.position, scene.position) < 0.15
+    assert shape_error(found.position, scene.position) < 0.05
 
 
 def test_camera_that_stands_still_is_named() -> None:
