@@ -18,7 +18,7 @@ from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.lifted.lifter_input import FEATURES
 from drocap_ros.tracks import read_npz
 from lab.training.lifter_loss import lifting_loss
-from lab.training.lifter_network import build_network
+from lab.training.lifter_network import EXACT, build_network
 from lab.training.lifter_samples import sample_batch
 from lab.training.mocap_bank import MocapBank
 from lab.training.muon import muon
@@ -219,8 +219,8 @@ def _check_finite(error: torch.Tensor) -> None:
 
 
 def export_onnx(network: torch.nn.Module, path: Path, facts: dict[str, str]) -> None:
-    """Write the lifter as ONNX, with :func:`lab.training.torch_extra.write_onnx`."""
+    """Write the lifter as ONNX, and a second one for live poses with products of integers, all but at its ends."""
     torch = pytorch()
     names = (["features"], ["joints", "log_sigma", "deeper", "still"])
     axes = {name: {0: "windows", 1: "frames"} for name in (*names[0], *names[1])}
-    write_onnx(network, torch.zeros(2, 16, FEATURES), path, *names, axes, facts, bytes_per_weight=1)
+    write_onnx(network, torch.zeros(2, 16, FEATURES), path, *names, axes, facts, exact=EXACT)

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import torch
 
 _JOINTS = len(BODY_17)
+#: Modules that stay in single precision: integers there cost 2 mm of 14 on exact keypoints, all others 0.1.
+EXACT = ("embed", "body.0", "body.18", "head", "signs")
 
 
 def build_network(width: int) -> torch.nn.Module:

@@ -91,11 +91,13 @@ def write_onnx(
     outputs: list[str],
     axes: dict[str, dict[int, str]],
     facts: dict[str, str],
-    bytes_per_weight: int = 2,
+    exact: tuple[str, ...] | None = None,
 ) -> None:
-    """Write a network as ONNX with weights in half precision or in eight bits, and ``facts`` as metadata.
+    """Write a network as ONNX with weights in half precision, and ``facts`` as metadata.
 
-    It is computed in single precision.  ``axes`` names the variable dimensions per input and output.
+    It is computed in single precision.  ``axes`` names the variable dimensions per input and output.  With ``exact``
+    the weights have eight bits, and a second file, ``NAME_quick.onnx``, has products of integers (:func:`in_integers`)
+    but in modules of these names.
     """
     torch, onnx = pytorch(), onnx_package()
     if path.suffix != ".onnx":
@@ -116,25 +118,71 @@ def write_onnx(
             opset_version=17,
             dynamo=False,
         )
-    model = onnx.load_from_string(exported.getvalue())
-    _store_small(model.graph, bytes_per_weight)
-    onnx.helper.set_model_props(model, facts)
-    onnx.checker.check_model(model)
-    onnx.save(model, str(path))
+    for quick in (False,) if exact is None else (False, True):
+        model = onnx.load_from_string(exported.getvalue())
+        if quick:
+            in_integers(model.graph, exact or ())
+        _store_small(model.graph, eight_bits=exact is not None)
+        onnx.helper.set_model_props(model, facts)
+        onnx.checker.check_model(model)
+        onnx.save(model, str(path.with_stem(f"{path.stem}_quick") if quick else path))
+
+
+def in_integers(graph: Any, exact: tuple[str, ...]) -> None:
+    """Make an ONNX graph's products with matrices those of integers, but of nodes with one of these names in theirs.
+
+    Values have eight bits by their range in each call, weights a scale for every column.
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    matrices = {tensor.name: tensor for tensor in graph.initializer}
+    nodes: list[Any] = []
+    for node in graph.node:
+        matrix = matrices.get(node.input[1]) if node.op_type == "MatMul" else None
+        if matrix is None or any(name in node.name.split("/") for name in exact):
+            nodes.append(node)
+            continue
+        parts = ("codes", "step", "value", "scale", "zero", "product", "real", "both")
+        codes, step, value, scale, zero, product, real, both = (f"{node.name}_{part}" for part in parts)
+        graph.initializer.remove(matrix)
+        for name, array in zip((codes, step), _codes(numpy_helper.to_array(matrix)), strict=True):
+            graph.initializer.append(numpy_helper.from_array(array, name))
+        # The runtime knows this sequence and computes it at once.
+        nodes += [
+            helper.make_node("DynamicQuantizeLinear", [node.input[0]], [value, scale, zero]),
+            helper.make_node("MatMulInteger", [value, codes, zero], [product]),
+            helper.make_node("Cast", [product], [real], to=TensorProto.FLOAT),
+            helper.make_node("Mul", [scale, step], [both]),
+            helper.make_node("Mul", [real, both], list(node.output)),
+        ]
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+def _codes(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (K, N), K even, as codes of eight bits (K, N) and the step (N,) between them.
+
+    Processors without instructions for neural networks add two neighbours' products in 16 bits: neighbours have no more
+    than 128 together, so that 255 times that fits.
+    """
+    size = np.abs(weights)
+    # 127, as rounding may add one.
+    step = (size[::2] + size[1::2]).max(axis=0).clip(1e-9) / 127
+    return np.rint(weights / step).astype(np.int8), step.astype(np.float32)
 
 
 #: Most weights along a column of a matrix that share a scale in eight bits.
 _BLOCK = 64
 
 
-def _store_small(graph: Any, bytes_per_weight: int) -> None:
+def _store_small(graph: Any, *, eight_bits: bool) -> None:
     """Replace the large weights of an ONNX graph by smaller ones; the runtime unfolds them once, when it loads them."""
     from onnx import TensorProto, helper, numpy_helper
 
     kept, nodes = [], []
     for tensor in graph.initializer:
         array = numpy_helper.to_array(tensor)
-        block = _block(array) if bytes_per_weight == 1 else 0
+        block = _block(array) if eight_bits else 0
         if array.dtype != np.float32 or array.size <= 1024:
             kept.append(tensor)
         elif block:

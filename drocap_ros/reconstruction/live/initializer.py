@@ -41,7 +41,7 @@ class LiveInitializer:
 
     def __init__(self, config: InitializerConfig | None = None) -> None:
         self.config = config or InitializerConfig()
-        lifter = Lifter.load(self.config.lifter or None)
+        lifter = Lifter.load(self.config.lifter or None, quick=True)
         self._lifter = StreamLifter(lifter, self.config.past_s, self.config.assumed_height_m)
         self._order = StreamOrder(self.config.late_s, self.config.gap_s)
         self.event = StreamEvent.FIRST

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.reconstruction.lifted.lifter import SHIPPED
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, PARTS
 from drocap_ros.skeleton import BODY_17, indices
 from lab.training.keypoint_errors import as_drawn, detect
@@ -220,7 +221,8 @@ def test_repeated_batches_and_processes_that_draw_leave_the_weights_to_the_seed(
     assert not all(np.array_equal(a, b) for a, b in zip(first, trained(2, workers=0), strict=True))
 
 
-def test_weights_of_eight_bits_change_the_outputs_little(tmp_path):
+@pytest.mark.parametrize("name", ["a", "a_quick"])
+def test_weights_of_eight_bits_change_the_outputs_little(tmp_path, name):
     torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
     import onnxruntime
@@ -231,13 +233,23 @@ def test_weights_of_eight_bits_change_the_outputs_little(tmp_path):
     network = build_network(96)
     export_onnx(network, tmp_path / "a.onnx", {"command": "test"})
     count = sum(weight.numel() for weight in network.parameters())
-    assert (tmp_path / "a.onnx").stat().st_size < 1.3 * count
+    assert (tmp_path / f"{name}.onnx").stat().st_size < 1.3 * count
     features = sample_batch(bank(), np.random.default_rng(4), 4, 64).features
-    session = onnxruntime.InferenceSession(str(tmp_path / "a.onnx"), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(str(tmp_path / f"{name}.onnx"), providers=["CPUExecutionProvider"])
     outputs = session.run(None, {"features": features})
     for exact, found in zip(network(torch.from_numpy(features)), outputs, strict=True):
         exact = exact.detach().numpy()
         assert np.abs(found - exact).mean() < 0.02 * np.abs(exact).mean()
+
+
+def test_no_sum_of_the_shipped_integers_overflows_sixteen_bits():
+    onnx = pytest.importorskip("onnx", reason="not installed")
+    graph = onnx.load(SHIPPED.with_stem(f"{SHIPPED.stem}_quick")).graph
+    arrays = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    codes = [arrays[node.input[1]].astype(int) for node in graph.node if node.op_type == "MatMulInteger"]
+    assert len(codes) > 30
+    # Processors of 2013 to 2019 add the products of two neighbours with values up to 255 in 16 bits.
+    assert max(np.abs(c.reshape(-1, 2, c.shape[1])).sum(axis=1).max() for c in codes) * 255 < 2**15
 
 
 def test_muon_steps_along_an_orthogonal_matrix():

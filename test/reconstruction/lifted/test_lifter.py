@@ -41,6 +41,20 @@ def test_shipped_network_names_its_training_data_and_is_small(lifter):
     assert SHIPPED.stat().st_size < 8 << 20
 
 
+def test_the_quick_twin_gives_the_same_newest_pose_but_for_its_rounding(lifter):
+    quick = Lifter.load(quick=True)
+    assert quick.origin == lifter.origin
+    person = simulate_person(np.arange(192) / 24.0, joint_set=BODY_17)
+    points = 1000.0 * PX_PER_MM * person[..., [0, 2]] * np.array([1.0, -1.0])
+    apart = []
+    for end in range(36, len(points), 12):
+        seen = LifterInput(points[end - 36 : end])
+        apart.append(quick.lift_last(seen).joints - lifter.lift_last(seen).joints)
+    millimetres = np.linalg.norm(apart, axis=-1) / PX_PER_MM
+    assert 0.0 < np.median(millimetres) < 4.0  # a tenth of the error of a newest pose
+    assert np.quantile(millimetres, 0.99) < 20.0
+
+
 def test_result_follows_scale_and_position_in_the_image(lifter):
     points = walker(50)
     here = lifter.lift(LifterInput(points))
