@@ -259,6 +259,7 @@ def test_clip_of_two_cameras_is_in_one_world_and_the_body_no_worse_than_without_
         "Cut at 3.0 s; nothing relates the shots: each goes on where the person stood. 0.0 to 3.0 s:"
     )
     assert words.count("Camera from the picture: a camera that moves") == 2
+    assert words.count("px off, enough of them in 100 % of the images") == 2
 
 
 def test_shot_whose_camera_is_unknown_leaves_all_in_camera_axes_and_is_named() -> None:

@@ -23,6 +23,8 @@ _ZOOM = 0.01
 _ZOOM_STEPS = 6
 #: Factors on the focal length that are tried for a camera that turns: least, largest, how many.
 _FOCALS = (0.5, 2.0, 9)
+#: What a turn leaves of the points' way where it explains it.
+_EXPLAINED = 0.5
 #: Share of pairs that have to agree.
 _MOST = 0.8
 #: Share of keyframes that see enough points, at least.
@@ -61,7 +63,9 @@ def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int)
         return Kind.STANDS
     turned, zoomed, zoom = _motion(pairs, matrix)
     if np.mean(turned < same) >= _MOST:
-        return Kind.TURNS
+        # What no turn explains either is the tracks' errors: of small images, or behind persons who pass.
+        explains = turned[way >= same] < _EXPLAINED * way[way >= same]
+        return Kind.TURNS if explains.mean() > 0.5 else Kind.STANDS
     zooms = (zoomed < same) & (np.abs(zoom) > _ZOOM)
     if zooms.any() and np.mean(zoomed < same) >= _MOST:
         return Kind.ZOOMS

@@ -51,6 +51,9 @@ def _shots(shots: list[Mapping[str, Any]], cuts_s: list[float]) -> str:
 def _camera(camera: Mapping[str, Any]) -> str:
     """The camera that the picture alone gave."""
     words = f"Camera from the picture: {camera.get('words', 'unknown')}"
+    if camera.get("residual_px"):
+        share = 100 * camera["covered"]
+        words += f"; fixed points {camera['residual_px']:.1f} px off, enough of them in {share:.0f} % of the images"
     if "up_std_deg" in camera:
         words += f"; up by {camera['up_words']}, to {camera['up_std_deg']:.1f} deg; metres by the assumed stature"
     if camera.get("focal_std_px"):

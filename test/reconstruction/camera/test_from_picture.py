@@ -86,11 +86,12 @@ def test_path_goes_on_over_the_ground_where_a_camera_hovers(seed: int) -> None:
     assert shape_error(found.position, scene.position) < 0.05
 
 
-def test_camera_that_stands_still_is_named() -> None:
+@pytest.mark.parametrize("noise_px", [0.3, 0.62])
+def test_camera_that_stands_still_is_named(noise_px: float) -> None:
     rotation, position = orbit(1, FPS)
     points = points_of(np.random.default_rng(6), 300)
     scene = seen(np.repeat(rotation, FRAMES, axis=0), np.repeat(position, FRAMES, axis=0), points, FPS)
-    found = camera_of(scene, noise_px=0.3)
+    found = camera_of(scene, noise_px=noise_px)
     assert found.kind is Kind.STANDS
     assert not found.position.any()
 
