@@ -150,6 +150,7 @@ def test_unusable_files_are_refused(tmp_path):
             load_bank([tmp_path / "a.npz"])
 
 
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")  # of the joints that are made so large
 def test_a_training_that_diverges_keeps_the_last_good_network():
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     from lab.training.lifter import LifterTraining, train
