@@ -1,10 +1,10 @@
 """Images per core-second of `drocap track` and of peers on the same clip: `python benchmarks/peers.py`.
 
 Each runs in turn, as often as the others, in a process of its own; what counts is the processor time from the first
-image to the last.  Peers are mediapipe (BlazePose in its wheel, one person) and rtmlib (its light detector and pose
-network, all persons, which it downloads), both one image after another with decoding by OpenCV; one that is not
-installed, in this Python or in that of `--python`, is left out.  What drocap tracks are the subject and the scene's
-fixed points.
+image to the last.  Peers are mediapipe up to 0.10.21 (BlazePose in its wheel, one person) and rtmlib (its light
+detector and pose network, all persons, which it downloads), both one image after another with decoding by OpenCV; one
+that is not installed, in this Python or in that of `--python`, is left out.  What drocap tracks are the subject and
+the scene's fixed points.
 """
 
 from __future__ import annotations

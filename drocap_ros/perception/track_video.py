@@ -28,8 +28,8 @@ def observe(
 ) -> list[PoseObservation]:
     """Observations of all frames: the same, bit for bit, with any number of threads.
 
-    With two or more, one decodes ahead and one follows the scene of the next image, while this one searches for the
-    subject: each of them needs its own result of the last image.
+    With two or more, one decodes ahead and one follows the scene of the next image, and runs the detector in it where
+    this image needed it, while this one estimates the pose: each of them needs its own result of the last image.
 
     Parameters
     ----------
