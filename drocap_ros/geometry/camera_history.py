@@ -113,9 +113,10 @@ class CameraHistory:
         matrix = self._matrix(int(stamp_ns[-1]), size)
         if matrix is None:
             return None
-        begin = bisect_left(self._stamps, int(stamp_ns[0]) - _GAP_NS)
-        end = bisect_right(self._stamps, int(stamp_ns[-1]) + _GAP_NS)
-        if begin == end:
+        first_ns, last_ns = stamp_ns[[0, -1]].tolist()  # from the pose before the one to that after the other
+        begin = max(bisect_left(self._stamps, first_ns - _GAP_NS), bisect_right(self._stamps, first_ns) - 1)
+        end = min(bisect_right(self._stamps, last_ns + _GAP_NS), bisect_left(self._stamps, last_ns) + 1)
+        if begin >= end:
             unknown = np.full((len(stamp_ns), 3, 3), np.nan)
             return WindowCamera(unknown, unknown[:, 0], matrix)
         known_ns, poses = np.array(self._stamps[begin:end], np.int64), np.array(self._poses[begin:end])

@@ -31,6 +31,8 @@ DRAIN_S = 5.0
 _QUIET_S = 0.05
 #: ... and for so many turns of the executor: on a busy machine a single timer's callback may take longer.
 _QUIET_TURNS = 5
+#: Interval at which a node asks whether the processes that started it live: asking costs more than many a message.
+_ORPHAN_S = 0.1
 #: At or above this niceness nodes use SCHED_BATCH: a message for them does not preempt other nodes.
 _BATCH = 10
 
@@ -46,7 +48,7 @@ def spin(
     # Without this, the garbage collector visits all modules again and again.
     gc.collect()
     gc.freeze()
-    parent, server = multiprocessing.parent_process(), os.getppid()
+    parent, server, asked_s = multiprocessing.parent_process(), os.getppid(), time.monotonic()
     try:
         while not stop.is_set() and node.context.ok():
             executor.spin_once(timeout_sec=0.1)
@@ -57,8 +59,10 @@ def spin(
                 on_ready = None
             # Without the bringup that started it a node stops, and without the server that forked it too: the bringup
             # then learns of no end of the node and starts another.
-            if parent is not None and not (parent.is_alive() and os.getppid() == server):
-                stop.set()
+            if parent is not None and time.monotonic() - asked_s > _ORPHAN_S:
+                asked_s = time.monotonic()
+                if not (parent.is_alive() and os.getppid() == server):
+                    stop.set()
         node.on_stop()
         _drain(executor, node)
         node.flush()
