@@ -24,6 +24,7 @@ Needs ../shared/mocap/dev, `world` excepted.  `--limit 2` takes the first two se
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -277,6 +278,7 @@ def main() -> int:
     parser.add_argument("--background", choices=("without", "with", "both"), default="both", help=words)
     parser.add_argument("--processes", type=int, default=1)
     args = parser.parse_args()
+    status = 0
     for part in args.parts or PARTS:
         if part != "world" and not args.mocap.is_dir():
             print(f"accuracy: no {args.mocap.name} beside the checkout, {part} is left out")
@@ -284,8 +286,9 @@ def main() -> int:
         try:
             PARTS[part](args)
         except InputError as error:
-            print(f"accuracy: {error}, {part} is left out")
-    return 0
+            print(f"accuracy: {error}; {part} is left out", file=sys.stderr)
+            status = error.exit_status
+    return status
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ class SubjectSearch:
     def begin(self, image: np.ndarray, stamp_ns: int, beside: Executor) -> None:
         """Begin to detect in the next image, where the subject will be if its pose in this one changes nothing.
 
-        The results are those of :meth:`detect` without it: another window is searched anew.
+        It changes no result: :meth:`detect` searches the windows that were not begun.
         """
         subject = self._tracker.followed(stamp_ns)
         size = (image.shape[1], image.shape[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,9 +84,7 @@ class Growth:
     def grow(self, most: int) -> Grown:
         """Place keyframes on both sides until ``most`` are known or no more can be placed; adjust now and then."""
         due = _FIRST_KEYS
-        while int(self.path.known.sum()) < most and (
-            (self._hovers() and self._on_ground()) or self.extend() or self._on_ground()
-        ):
+        while int(self.path.known.sum()) < most and any(place() for place in self._ways()):
             if self.path.known.sum() >= due:
                 self.adjust()
                 due = int(_GROWTH * self.path.known.sum())
@@ -103,10 +102,15 @@ class Growth:
         """(J,) points whose rays show no depth."""
         return np.asarray(np.linalg.norm(self._ray - self._first, axis=1) < _LITTLE_PARALLAX)
 
-    def _hovers(self) -> bool:
-        """Whether most points that place the next keyframes have no depth: each place would lean on the last one's."""
-        seen = [piece[usable] for usable, piece, _ in map(self._matches, self._next_keys())]
-        return bool(seen) and bool(self._flat[np.concatenate(seen)].mean() > 0.5)
+    def _ways(self) -> tuple[Callable[[], bool], Callable[[], bool]]:
+        """Ways to place the next keyframes, the better one first.
+
+        Where a camera hovers, most points that would place them have no depth: each place would lean on the last one's.
+        """
+        flat = self._flat
+        seen = [flat[piece[usable]] for usable, piece, _ in map(self._matches, self._next_keys())]
+        hovers = sum(int(of.sum()) for of in seen) > 0.5 * sum(map(len, seen))
+        return (self._on_ground, self.extend) if hovers else (self.extend, self._on_ground)
 
     def _on_ground(self) -> bool:
         """Place the next keyframes by points that are taken to lie on the ground; whether any could be placed.

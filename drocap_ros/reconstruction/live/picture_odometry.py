@@ -168,7 +168,7 @@ class _Held(NamedTuple):
 
 
 def _held(last: Tracks, stamp_ns: np.ndarray) -> _Held:
-    """What the window before tells of images of stamps (F,), not all of which it has."""
+    """The camera of the window before, at those images of stamps (F,) that lie in its time."""
     assert last.camera_rotation is not None
     assert last.camera_position is not None
     inside = np.flatnonzero((stamp_ns >= last.stamp_ns[0]) & (stamp_ns <= last.stamp_ns[-1]))

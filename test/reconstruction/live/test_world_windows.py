@@ -269,7 +269,7 @@ def test_reports_of_another_flight_are_refused_by_the_points_and_seldom_asked_ag
 
     monkeypatch.setattr("drocap_ros.reconstruction.live.fused_camera.fuse_telemetry", counted)
     other = replace(true, rotation=true.rotation[::-1], position=true.position[::-1])
-    # The second subject has the same vehicle: nothing is asked anew.
+    # The same vehicle films the second subject: the pause goes on.
     half = len(true.observations) // 2
     stream = [replace(o, track_id=1 + (i >= half)) for i, o in enumerate(true.observations)]
     windows = [w.window for w in windows_of(run(stream, other.history(keep_s=60.0).along, points_at=true.points_at))]
