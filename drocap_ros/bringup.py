@@ -21,7 +21,6 @@ from pathlib import Path
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -43,6 +42,7 @@ from drocap_ros.ros.processes import (
     node_class,
     remaps,
 )
+from drocap_ros.ros.rclpy_internals import node_executor
 from drocap_ros.ros.spin import spin
 from drocap_ros.ros.topics import NODES, section_of, with_people
 
@@ -64,8 +64,8 @@ def bringup(
     ----------
     config : parameters of every component
     nodes : names out of ``ros.topics.NODES``; with ``pose_estimator.people`` those of further persons are added
-    processes : one process each (True), or all in this one, a thread each: for tests and scripts, since the nodes then
-        share Python's lock
+    processes : one process each (True), or all in this one, a thread each: for small machines, tests and scripts; the
+        nodes then share Python's lock
     namespace : of the topics that have no leading slash; TF too lies in it, unless it is the default one
     domain_id : DDS domain; None takes a free one and keeps discovery on this machine, so that graphs side by
         side do not receive each other's messages
@@ -214,8 +214,7 @@ class _NodeThread:
         try:
             node = make()
             self._made.set()
-            # Not the EventsExecutor of the processes, which replaces the signal handlers of its process.
-            spin(node, SingleThreadedExecutor(context=context), self._stop)
+            spin(node, node_executor(context), self._stop)
         except BaseException as error:  # noqa: BLE001 -- raised in the thread that waits for the graph
             self._error = error
         finally:

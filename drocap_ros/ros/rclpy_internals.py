@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TypeAlias
 
 from lifecycle_msgs.srv import ChangeState
+from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNodeMixin
@@ -42,9 +43,9 @@ MessageInfo: TypeAlias = Mapping[str, int]
 AnswerKey: TypeAlias = Future | _rclpy.rmw_request_id_t
 
 
-def node_executor() -> Executor:
-    """Executor of a node that has a process of its own: it may replace the handlers of signals."""
-    executor: Executor = EventsExecutor()
+def node_executor(context: Context | None = None) -> Executor:
+    """Executor of one node; handlers of signals stay as they are, but for those of the default context."""
+    executor: Executor = EventsExecutor(context=context)
     return executor
 
 

@@ -34,7 +34,7 @@ def add_start_options(parser: argparse.ArgumentParser) -> None:
     """Options of every command that starts nodes."""
     add_place_options(parser)
     parser.add_argument(
-        "--one-process", action="store_true", help="all nodes in this process, a thread each: for tests"
+        "--one-process", action="store_true", help="all nodes in this process, a thread each: less memory"
     )
     parser.add_argument("--quiet", action="store_true", help="no status line, only errors")
 
