@@ -25,11 +25,11 @@ _CONTACT_STDS = 3.0
 #: Deviation of the logarithm of a scale that is guessed: a factor of two.
 _GUESS_STD = 0.7
 #: Deviation of the scale below which contacts measure it.
-_FEET_TELL = 0.05
+FEET_TELL = 0.05
 #: Standard deviation (degrees) of a plane through three points.
 _LEVEL_STD_DEG = 3.0
 #: Least standard deviation of the scale by a body's distance from the camera: the lifter's sizes.
-_GROUND_SCALE_STD = 0.04
+LEAST_SCALE_STD = 0.04
 #: Standard deviation (degrees) of the body's mean direction from the vertical: people lean, and the lifter does.
 _BODY_STD_DEG = 5.0
 #: Angle (degrees) from the mean at which one frame's direction has half its weight.
@@ -121,7 +121,7 @@ def set_upright(
     if np.ptp(position, axis=0).any():
         level = by_ground(up, feet, position, points)
         contacts = by_contacts(feet, position, stamp_ns)
-        feet_tell = contacts is not None and contacts.std < _FEET_TELL
+        feet_tell = contacts is not None and contacts.std < FEET_TELL
         found = [None if level is None else level.scale, contacts]
         factor, factor_std = _together(
             [scale for scale in found if scale is not None] or [_guess(feet, position, points)]
@@ -150,7 +150,8 @@ def _together(found: list[PathScale]) -> PathScale:
     """Scales as one, by their deviations."""
     weight = np.array([scale.std**-2 for scale in found])
     log = np.log([scale.factor for scale in found])
-    return PathScale(float(np.exp(weight @ log / weight.sum())), float(weight.sum() ** -0.5))
+    std = max(float(weight.sum() ** -0.5), LEAST_SCALE_STD)
+    return PathScale(float(np.exp(weight @ log / weight.sum())), std)
 
 
 def _guess(feet: np.ndarray, position: np.ndarray, points: np.ndarray) -> PathScale:
@@ -194,7 +195,7 @@ def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np
         return None
     log = np.log(standing[fits] / above[fits])
     spread = 1.48 * float(np.median(np.abs(log - np.median(log))))
-    scale = PathScale(float(np.exp(np.median(log))), max(_GROUND_SCALE_STD, 0.5 * spread))
+    scale = PathScale(float(np.exp(np.median(log))), max(LEAST_SCALE_STD, 0.5 * spread))
     return Level(plane.up, plane.level, scale, spread)
 
 

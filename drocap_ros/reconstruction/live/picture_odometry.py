@@ -4,6 +4,9 @@ A path begins as a recording's does (``camera/picture_world.py``): upright, in m
 on with it: new keyframes are placed by its points, as a path grows offline, and images in the time of both windows keep
 their camera.  They need not be the same images: a late adjustment takes every second to fourth.  Where that fails, the
 path is lost, and another one begins at the last place and heading of the camera.
+
+A path begins in a few seconds, in which a drone hovers or climbs, and feet tell its metres badly.  Where those of a
+later window contradict them, the path takes over theirs.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.contacts import ANKLES
 from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.geometry.rotations import hat, matrix_from_quaternion, project_to_so3, quaternion_from_matrix
 from drocap_ros.reconstruction.camera.from_picture import fits
@@ -20,8 +24,14 @@ from drocap_ros.reconstruction.camera.fusion import joints_by_camera
 from drocap_ros.reconstruction.camera.growth import Grown, Growth, adjusted, turns
 from drocap_ros.reconstruction.camera.kinds import Kind, cut_at, kind_of
 from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ, Knots
-from drocap_ros.reconstruction.camera.picture_world import PictureWorld, picture_camera, with_camera
+from drocap_ros.reconstruction.camera.picture_world import (
+    PictureWorld,
+    picture_camera,
+    seen_from_camera,
+    with_camera,
+)
 from drocap_ros.reconstruction.camera.sightings import Sightings
+from drocap_ros.reconstruction.camera.upright import FEET_TELL, LEAST_SCALE_STD, by_contacts
 from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
@@ -29,6 +39,7 @@ from drocap_ros.reconstruction.live.window import Retry
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.world_model import WorldConfig
+from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
 #: Shortest window (s) in which a path begins: a step and some way, and points in most of it.
@@ -45,12 +56,25 @@ _STRAIGHT_S = 0.5
 _NEWEST_S = 0.5
 
 
+class Person(NamedTuple):
+    """A window's poses of a subject of an assumed stature."""
+
+    poses: ImagePoses
+    height_m: float
+    subject: int
+
+    def metres_per_px(self, tracks: Tracks) -> np.ndarray:
+        """(F,) in the images of tracks with a camera's matrix."""
+        return metres_per_px(true_shape(self.poses.in_image, tracks.camera_matrix), tracks.stamp_ns, self.height_m)
+
+
 @dataclass(frozen=True)
 class PicturePath:
     """A window's camera in ``odom``; F images.
 
     tracks : with the camera; world : how it was found, with up, metres and their deviations; number : of the path
     begun_ns : stamp of the path's first image; drift_m, drift_rad : deviation of place and turn within a second
+    subject : whose assumed stature gives its metres; rescaled : how often it has taken over those of a later window
     """
 
     tracks: Tracks
@@ -59,6 +83,8 @@ class PicturePath:
     begun_ns: int
     drift_m: float
     drift_rad: float
+    subject: int
+    rescaled: int = 0
 
     @property
     def words(self) -> str:
@@ -82,10 +108,10 @@ class PictureOdometry:
         #: Why there is no path or the last one ended, in words, and how many were lost.
         self.lost, self.losses = "", 0
 
-    def follow(self, tracks: Tracks, poses: ImagePoses, height_m: float, config: WorldConfig) -> PicturePath | None:
+    def follow(self, tracks: Tracks, person: Person, config: WorldConfig) -> PicturePath | None:
         """The path in a window with fixed points; None = there is none, ``lost`` says why.
 
-        tracks : with the camera's matrix where it is calibrated; poses : of a person of ``height_m``
+        tracks : with the camera's matrix where it is calibrated
         """
         before, stamps = self._path, tracks.stamp_ns
         if before is not None:
@@ -93,9 +119,11 @@ class PictureOdometry:
             self._path = _continued(before, tracks) if shared else None
             if self._path is None:
                 self._lose(before, tracks, shared)
+            else:
+                self._path = _in_metres(self._path, person)
         long = stamps[-1] - stamps[0] >= _FIRST_S * 1e9
         if self._path is None and self.since_ns <= stamps[0] and self._retry.due(int(stamps[-1])) and long:
-            self._path = self._begun(tracks, poses, height_m, config)
+            self._path = self._begun(tracks, person, config)
         return self._path
 
     def _lose(self, path: PicturePath, tracks: Tracks, shared: bool) -> None:
@@ -114,15 +142,14 @@ class PictureOdometry:
         self.since_ns, self.lost = at, f"path {path.number} lost: {why}; another one begins at its end"
         self.losses += 1
 
-    def _begun(self, tracks: Tracks, poses: ImagePoses, height_m: float, config: WorldConfig) -> PicturePath | None:
+    def _begun(self, tracks: Tracks, person: Person, config: WorldConfig) -> PicturePath | None:
         """A path that begins in this window."""
         camera = picture_camera(tracks)
         if camera is None or not camera.kind.known:
             self._pause("too few images" if camera is None else camera.kind.value, tracks)
             return None
         tracks = replace(tracks, camera_matrix=camera.matrix)
-        per_px = metres_per_px(true_shape(poses.in_image, camera.matrix), tracks.stamp_ns, height_m)
-        tracks, world = with_camera(tracks, camera, poses, per_px, config)
+        tracks, world = with_camera(tracks, camera, person.poses, person.metres_per_px(tracks), config)
         assert world.upright is not None
         if world.upright.scale_std > _LARGEST_SCALE_STD:
             self._pause("neither feet nor ground give its metres", tracks)
@@ -132,7 +159,8 @@ class PictureOdometry:
         self._number, self._retry = self._number + 1, Retry()
         scale = _way(tracks) / max(float(np.linalg.norm(np.ptp(camera.position, axis=0))), 1e-9)
         drift = np.nan_to_num([scale * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)
-        return PicturePath(tracks, world, self._number, int(tracks.stamp_ns[0]), float(drift[0]), float(drift[1]))
+        begun_ns = int(tracks.stamp_ns[0])
+        return PicturePath(tracks, world, self._number, begun_ns, float(drift[0]), float(drift[1]), person.subject)
 
     def _pause(self, why: str, tracks: Tracks) -> None:
         self._retry.failed(int(tracks.stamp_ns[-1]))
@@ -237,6 +265,28 @@ def _as_before(rotation: np.ndarray, position: np.ndarray, held: _Held) -> tuple
     scale = float(np.sqrt((theirs_spread + _PLACE_M**2) / (spread + _PLACE_M**2)))
     moved = scale * (position @ turn.T - place.mean(axis=0)) + theirs_at.mean(axis=0)
     return rotation @ turn.T, moved
+
+
+def _in_metres(path: PicturePath, person: Person) -> PicturePath:
+    """The path in the metres at which the window's feet rest, where its own contradict them; the person stays in place.
+
+    Another person's stature follows from the metres that the path has.
+    """
+    tracks, upright = path.tracks, path.world.upright
+    rotation, position = tracks.camera_rotation, tracks.camera_position
+    assert rotation is not None
+    assert position is not None
+    assert upright is not None
+    if person.subject != path.subject or not np.ptp(position, axis=0).any():
+        return path
+    joints = seen_from_camera(tracks, person.poses, person.metres_per_px(tracks)) @ rotation
+    scale = by_contacts(joints[:, ANKLES], position, tracks.stamp_ns)
+    if scale is None or scale.std > FEET_TELL or abs(np.log(scale.factor)) < LEAST_SCALE_STD:
+        return path
+    floor = (position[-1] + joints[-1, BODY_17.index("pelvis")]) * [1.0, 1.0, 0.0]
+    world = replace(path.world, upright=upright._replace(scale_std=max(scale.std, LEAST_SCALE_STD)))
+    tracks = replace(tracks, camera_position=floor + scale.factor * (position - floor))
+    return replace(path, tracks=tracks, world=world, rescaled=path.rescaled + 1)
 
 
 def _from(tracks: Tracks, position: np.ndarray, rotation: np.ndarray) -> Tracks:

@@ -11,12 +11,11 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.method import WindowSolution
-from drocap_ros.reconstruction.live.picture_odometry import PictureOdometry, PicturePath, own_covariance
+from drocap_ros.reconstruction.live.picture_odometry import Person, PictureOdometry, PicturePath, own_covariance
 from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Window
 from drocap_ros.reconstruction.live.world_chain import WorldChain
-from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
-from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
+from drocap_ros.reconstruction.world.placement import place_in_world
 from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.skeleton import BODY_17
@@ -30,7 +29,7 @@ class PictureWindows:
         self._config = world_config(config)
         self._length_ns = round(config.world_window_s * 1e9)
         self._odometry, self._chain = PictureOdometry(), WorldChain()
-        self._of: tuple[int, int] | None = None  # subject and path of the chain
+        self._of: tuple[int, int, int] | None = None  # subject, path and metres of the chain
 
     def adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
         """The window's result in ``odom``, or that in the camera's axes with the reason.
@@ -46,24 +45,31 @@ class PictureWindows:
         tracks = _tracks(w.frames(use))
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
         had = self._odometry.losses
-        path = self._odometry.follow(tracks, poses, w.height_m, self._config)
+        person = Person(poses, w.height_m, w.subject)
+        path = self._odometry.follow(tracks, person, self._config)
         lost, why = self._odometry.losses > had, self._odometry.lost
         if path is None:
             return replace(camera_result, picture=why, lost=lost)
-        if self._of != (w.subject, path.number):
-            self._of, self._chain = (w.subject, path.number), WorldChain()
-        placed = self._placed(path, poses, w.keypoints[use], camera_result, w.height_m)
+        of = w.subject, path.number, path.rescaled
+        if self._of != of:
+            self._of, self._chain = of, WorldChain()
+        placed = self._placed(path, person, w.keypoints[use], camera_result)
         return replace(placed, picture=f"{path.words}; {why}" if lost else path.words, lost=lost)
 
     def _placed(
-        self, path: PicturePath, poses: ImagePoses, keypoints: Keypoints2D, seen: AdjustedWindow, height_m: float
+        self, path: PicturePath, person: Person, keypoints: Keypoints2D, seen: AdjustedWindow
     ) -> AdjustedWindow:
         """The window's last images, those of the path, in ``odom``; ``seen`` : all of it in camera axes."""
-        tracks, config, use = path.tracks, path.world.config, slice(len(seen.stamp_ns) - len(keypoints), None)
+        poses, tracks, config, use = (
+            person.poses,
+            path.tracks,
+            path.world.config,
+            slice(len(seen.stamp_ns) - len(keypoints), None),
+        )
         rotation, position = tracks.camera_rotation, tracks.camera_position
         assert rotation is not None
         assert position is not None
-        per_px = metres_per_px(true_shape(poses.in_image, tracks.camera_matrix), tracks.stamp_ns, height_m)
+        per_px = person.metres_per_px(tracks)
         refined = None
         if config is not None:
             config = self._chain.steps(config, tracks.stamp_ns)

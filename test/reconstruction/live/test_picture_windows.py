@@ -97,6 +97,24 @@ def test_a_path_goes_on_in_windows_that_share_no_image(speed_deg_s: float, strid
         assert np.linalg.norm(place[0] - place[1], axis=1).max() < 0.1
 
 
+def test_a_path_takes_over_the_metres_of_later_windows() -> None:
+    true, small_s = orbit(11.0), 4.5
+    seen = list(true.observations)
+    for i, o in enumerate(seen[: round(small_s * FPS)]):
+        middle = np.nanmean(o.keypoints, axis=0)
+        seen[i] = replace(o, keypoints=(middle + 0.8 * (o.keypoints - middle)).astype(np.float32))
+    there = [w for w in windows(replace(true, observations=seen), true.points_at) if w.window.in_map is not None]
+    factors = []
+    for w in there:
+        place = true.position[np.searchsorted(true.stamp_ns, w.window.stamp_ns)]
+        ways = [np.linalg.norm(path - path.mean(axis=0)) for path in (camera_of(w)[1], place)]
+        factors.append(ways[0] / ways[1])
+        assert "path 1," in w.window.picture
+    assert factors[0] > 1.15  # a person that seems farther away
+    assert abs(factors[-1] - 1.0) < 0.08
+    assert abs(there[-1].joints3d[:, :, 2].min()) < 0.2  # the floor stays
+
+
 def test_a_path_that_a_cut_ends_is_told_and_the_next_one_begins_at_its_place() -> None:
     true, other = flown(), orbit(9.0, seed=3)
     cut_ns = int(true.stamp_ns[0]) + 5 * S
