@@ -130,14 +130,8 @@ class JointMap:
         A joint is NaN, its confidence 0, where one of its parts is NaN.  The line's length is at least 5 % of
         ``box_size`` (...) px: a view from above shortens the line, not the uncertainty of the head.
         """
-        seen = np.isfinite(xy).all(axis=-1)
-        used = self.weights != 0
-        known = ~(used & ~seen[..., None, :]).any(axis=-1)
-        points = np.nan_to_num(xy)
-        # A shoulder whose partner is not seen stays where it is drawn.
-        moved = ~((self.outwards != 0) & ~seen[..., None, :]).any(axis=-1, keepdims=True)
-        shift = np.where(moved, self.outwards @ points, 0.0)
-        out = self.weights @ points + shift
+        out, out_confidence = self.places(xy, confidence)
+        points, moved, shift = self._shifted(xy)
         # The errors of the parts are assumed independent.
         parts = np.where(moved, self.weights + self.outwards, self.weights)
         out_covariance = parts**2 @ np.nan_to_num(covariance)
@@ -145,11 +139,26 @@ class JointMap:
         length = np.maximum(np.linalg.norm(self.lines @ points, axis=-1), _LEAST_LINE * np.asarray(box_size)[..., None])
         extra = np.where(self.spread > 0, (self.spread * length) ** 2, 0.0)
         out_covariance = out_covariance + extra[..., None] * np.array([1.0, 0.0, 1.0])
+        out_covariance[np.isnan(out[..., 0])] = np.nan
+        return out, out_covariance, out_confidence
+
+    def places(self, xy: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints and confidence of :meth:`apply`, without the work for the covariance."""
+        used = self.weights != 0
+        known = ~(used & ~np.isfinite(xy).all(axis=-1)[..., None, :]).any(axis=-1)
+        points, _, shift = self._shifted(xy)
+        out = np.where(known[..., None], self.weights @ points + shift, np.nan)
         lowest = np.where(used, np.nan_to_num(confidence)[..., None, :], np.inf).min(axis=-1)
         out_confidence = np.where(self.spread > 0, _EXTRAPOLATED_CONFIDENCE, 1.0) * lowest
-        out[~known] = np.nan
-        out_covariance[~known] = np.nan
-        return out, out_covariance, np.where(known, out_confidence, 0.0)
+        return out, np.where(known, out_confidence, 0.0)
+
+    def _shifted(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Keypoints without NaN, which joints (..., B, 1) are moved outwards, and how far (..., B, 2) px."""
+        points = np.nan_to_num(xy)
+        seen = np.isfinite(xy).all(axis=-1)
+        # A shoulder whose partner is not seen stays where it is drawn.
+        moved = ~((self.outwards != 0) & ~seen[..., None, :]).any(axis=-1, keepdims=True)
+        return points, moved, np.where(moved, self.outwards @ points, 0.0)
 
 
 def joint_set_of(names: Sequence[str]) -> tuple[JointSet, np.ndarray]:

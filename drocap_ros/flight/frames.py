@@ -10,6 +10,8 @@ Quaternions are x y z w (ROS); MAVLink's are w x y z.  Arrays may have any leadi
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, quaternion_multiply
@@ -53,7 +55,9 @@ _FLU_TO_OPTICAL = _as_matrix(np.array([0.0, 0.0, 0.0, 1.0]), quaternion_from_mat
 
 def orientation_to_ros(frd_to_ned: np.ndarray) -> np.ndarray:
     """(..., 4) x y z w, rotation body FRD -> NED, to the rotation body FLU -> ENU, or back; w of the result >= 0."""
-    q = frd_to_ned @ _BETWEEN_AVIATION_AND_ROS
+    q: np.ndarray = frd_to_ned @ _BETWEEN_AVIATION_AND_ROS
+    if q.ndim == 1:
+        return -q if q[3] < 0 else q
     return np.where(q[..., 3:] < 0, -q, q)
 
 
@@ -68,8 +72,8 @@ def optical_orientation(camera_flu_to_enu: np.ndarray) -> np.ndarray:
 
 def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.ndarray:
     """(4,) x y z w of MAVLink's angles: yaw about down, then pitch, then roll; rotation body FRD -> NED."""
-    half = 0.5 * np.array([roll_rad, pitch_rad, yaw_rad])
-    (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
+    halves = 0.5 * roll_rad, 0.5 * pitch_rad, 0.5 * yaw_rad
+    (cr, cp, cy), (sr, sp, sy) = map(math.cos, halves), map(math.sin, halves)
     return np.array(
         [
             sr * cp * cy - cr * sp * sy,
@@ -82,7 +86,7 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
 
 def yaw_of(frd_to_ned: np.ndarray) -> np.ndarray:
     """(...) rad, heading from north towards east, of rotations (..., 4) x y z w body FRD -> NED."""
-    x, y, z, w = (frd_to_ned[..., i] for i in range(4))
+    x, y, z, w = frd_to_ned.tolist() if frd_to_ned.ndim == 1 else np.moveaxis(frd_to_ned, -1, 0)
     yaw: np.ndarray = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return yaw
 

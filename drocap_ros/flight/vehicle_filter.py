@@ -93,7 +93,7 @@ class VehicleFilter:
         if math.isfinite(gap_s):
             way = min(max(gap_s, 0.0), _ERRORS.longest_gap_s) * 0.5 * (self._reported[1] + velocity)
             step = position - self._reported[0] - way
-            jump_m = float(np.linalg.norm(step))
+            jump_m = math.sqrt(step @ step)
         if 0.0 < gap_s <= _ERRORS.longest_gap_s and jump_m <= _ERRORS.jump_m:
             self._predict(gap_s, 0.5 * (self._reported[1] + velocity))
             self._correct(gap_s, position)
@@ -102,7 +102,7 @@ class VehicleFilter:
             self._begin(position)
         self._stamp_s, self._reported = stamp_s, (position, velocity)
         self.velocity = velocity - self._error
-        error_m_s = float(np.linalg.norm(self._error))
+        error_m_s = math.sqrt(self._error @ self._error)
         return Doubt(
             jump_m if jump_m > _ERRORS.jump_m else 0.0,
             error_m_s if error_m_s > _ERRORS.contradiction_m_s else 0.0,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 
@@ -66,9 +68,8 @@ def complete_rotation(rows: np.ndarray) -> np.ndarray:
 
 def matrix_from_quaternion(q: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), x y z w; they are normalized first."""
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     single = q.ndim == 1  # NumPy takes five times as long as Python for a few numbers
-    x, y, z, w = q.tolist() if single else np.moveaxis(q, -1, 0)
+    x, y, z, w = normalized(*q.tolist()) if single else np.moveaxis(unit(q), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -96,7 +97,22 @@ def quaternion_from_matrix(r: np.ndarray) -> np.ndarray:
     )  # fmt: skip
     best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)[..., None, None]
     q = np.take_along_axis(rows, np.broadcast_to(best, (*rows.shape[:-2], 1, 4)), axis=-2)[..., 0, :]
+    return unit(q)
+
+
+def unit(q: np.ndarray) -> np.ndarray:
+    """Vectors (..., N) of length 1."""
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def normalized(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
+    """One quaternion of length 1, to the bits of :func:`unit`; NaN where it has no length."""
+    length = _length(x, y, z, w) or math.nan
+    return x / length, y / length, z / length, w / length
+
+
+def _length(x: float, y: float, z: float, w: float) -> float:
+    return math.sqrt(x * x + y * y + z * z + w * w)
 
 
 def unit_quaternions(q: np.ndarray) -> np.ndarray:
@@ -107,8 +123,9 @@ def unit_quaternions(q: np.ndarray) -> np.ndarray:
 
 def slerp(q0: np.ndarray, q1: np.ndarray, s: np.ndarray | float) -> np.ndarray:
     """Spherical interpolation (..., 4) from ``q0`` (s = 0) to ``q1`` (s = 1) along the shorter arc; x y z w."""
-    q0 = q0 / np.linalg.norm(q0, axis=-1, keepdims=True)
-    q1 = q1 / np.linalg.norm(q1, axis=-1, keepdims=True)
+    if q0.ndim == q1.ndim == 1 and isinstance(s, float):
+        return _slerp_one(q0.tolist(), q1.tolist(), s)
+    q0, q1 = unit(q0), unit(q1)
     dot = np.sum(q0 * q1, axis=-1, keepdims=True)
     q1 = np.where(dot < 0, -q1, q1)
     s = np.asarray(s, dtype=float)[..., None]
@@ -121,7 +138,24 @@ def slerp(q0: np.ndarray, q1: np.ndarray, s: np.ndarray | float) -> np.ndarray:
     a = np.where(small, 1.0 - s, np.sin((1.0 - s) * angle) / sine)
     b = np.where(small, s, np.sin(s * angle) / sine)
     out = a * q0 + b * q1
-    return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+    return unit(out)
+
+
+def _slerp_one(first: list[float], last: list[float], s: float) -> np.ndarray:
+    """The same of two quaternions, to the same bits: NumPy's angles, and Python's numbers."""
+    a, b = normalized(*first), normalized(*last)
+    if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0:
+        b = (-b[0], -b[1], -b[2], -b[3])
+    angle = 2.0 * np.arctan2(
+        _length(b[0] - a[0], b[1] - a[1], b[2] - a[2], b[3] - a[3]),
+        _length(b[0] + a[0], b[1] + a[1], b[2] + a[2], b[3] + a[3]),
+    )
+    if angle < 1e-6:
+        u, v = 1.0 - s, s
+    else:
+        sines = np.sin(((1.0 - s) * angle, s * angle, angle)).tolist()
+        u, v = sines[0] / sines[2], sines[1] / sines[2]
+    return np.array(normalized(*(u * p + v * q for p, q in zip(a, b, strict=True))))
 
 
 def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -108,6 +108,7 @@ def noisy_keypoints(
     parts = [
         _noisy(px[:, part], hidden[:, part], height, BODY_17.joints[part], np.random.default_rng(key), rates)
         for part, key in ((slice(count), [seed, 0x0B5]), (slice(count, px.shape[1]), [seed, 0x0B5, count]))
+        if part.start is None or px.shape[1] > count
     ]
     return NoisyKeypoints(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
 
@@ -132,7 +133,7 @@ def _noisy(
     sigma = height[:, None] * share * np.where(hidden, _OCCLUDED_NOISE, 1.0)
     white = rng.standard_normal((frames, joints, 2))
     white[1:] *= np.sqrt(1 - _CORRELATION**2)
-    noise = lfilter([1.0], [1.0, -_CORRELATION], white, axis=0)
+    noise = lfilter([1.0], [1.0, -_CORRELATION], white, axis=0) if frames > 1 else white
     keypoints = px + noise_scale * sigma[..., None] * noise
 
     rate = np.where(hidden, 3.0, 1.0)

@@ -45,6 +45,17 @@ def test_slerp_is_scipys() -> None:
     np.testing.assert_allclose(so3.matrix_from_quaternion(ours), theirs, atol=1e-12)
 
 
+def test_one_quaternion_is_turned_as_many_are() -> None:
+    rng = np.random.default_rng(4)
+    for size in (1.0, 1e-3, 1e-8):  # of the step between the two, down to where the angle counts as none
+        a = 3.0 * rng.standard_normal((50, 4))
+        b = -a + size * rng.standard_normal((50, 4))
+        many = so3.slerp(a, b, np.full(50, 1.3))
+        np.testing.assert_allclose([so3.slerp(*pair, 1.3) for pair in zip(a, b, strict=True)], many, atol=1e-15)
+        one_by_one = [so3.matrix_from_quaternion(q) for q in a]
+        np.testing.assert_allclose(one_by_one, so3.matrix_from_quaternion(a), atol=1e-15)
+
+
 def test_projection_leaves_rotations_and_is_the_closest() -> None:
     rng = np.random.default_rng(0)
     r = Rotation.random(50, random_state=0).as_matrix()

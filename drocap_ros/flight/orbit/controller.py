@@ -186,7 +186,7 @@ class OrbitController:
         if action == Action.ORBIT:
             setpoint = self._orbit.setpoint(seen, self.safety, self._observer.framing, dt)
             # A setpoint that stands stays at zero: nothing moves by an estimate alone.
-            if setpoint is not None and float(np.linalg.norm(setpoint.velocity)) > _STANDING_M_S:
+            if setpoint is not None and math.sqrt(setpoint.velocity @ setpoint.velocity) > _STANDING_M_S:
                 # The autopilot's loop compares it with the velocity that it reports, error included.
                 setpoint = setpoint._replace(velocity=setpoint.velocity + seen.vehicle.velocity_offset)
         elif action == Action.HOLD and self.safety.hold_position is not None:

@@ -152,7 +152,7 @@ def loss_condition(settings: LossSettings | None, meaning: LossAction | None, lo
 def limit_condition(seen: Observed, fence_centre: np.ndarray | None, limits: Limits) -> Condition | None:
     """Which limit of place or speed is reached, the braking distance included; the vehicle's state must be known."""
     safety = limits.safety
-    speed = float(np.linalg.norm(seen.vehicle.velocity))
+    speed = math.sqrt(seen.vehicle.velocity @ seen.vehicle.velocity)
     if speed > safety.speed_margin * limits.orbit.max_speed_m_s:
         return condition(_C.TOO_FAST, speed_m_s=speed)
     climb = float(seen.vehicle.velocity[2])
@@ -271,7 +271,9 @@ def oldest_state_s(safety: SafetyConfig, *, patient: bool = False) -> float:
 
 def oldest_subject_s(seen: Observed, safety: SafetyConfig) -> float:
     """Greatest age in s of the subject at which the vehicle is moved: less at speed."""
-    speed = float(np.linalg.norm(np.nan_to_num(seen.vehicle.velocity)))
+    velocity = seen.vehicle.velocity
+    velocity = velocity if np.isfinite(velocity).all() else np.nan_to_num(velocity)
+    speed = math.sqrt(velocity @ velocity)
     return min(safety.max_subject_age_s, max(safety.max_blind_m / max(speed, 1e-3), _LEAST_SUBJECT_AGE_S))
 
 

@@ -281,5 +281,5 @@ def _speed_toward(speed: Ramp, target: float, max_acceleration: float, jerk: flo
 
 
 def _limited(vector: np.ndarray, length: float) -> np.ndarray:
-    norm = float(np.linalg.norm(vector))
+    norm = math.sqrt(vector @ vector)
     return vector if norm <= length else vector * (length / norm)

@@ -24,6 +24,8 @@ _WANDERING_MEMORY_NS = 1 * NS  # where the height wanders: recorded ones change 
 _WANDERING_RATIOS = 8  # images: half a second of them
 _NEARER_S = 1.0  # filter of what the two ranges disagree by
 _MAX_SURPRISE = 0.3  # share of the range, beyond which the gate decides
+#: (6, 6): a place and a velocity that stay, and by the second what the velocity adds to the place.
+_STAYS, _MOVES = np.eye(6), np.eye(6, k=3)
 
 
 @dataclass(frozen=True)
@@ -196,11 +198,10 @@ class SubjectFilter:
 
     def _predicted(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         assert self._state is not None
-        move = np.eye(6)
-        move[:3, 3:] = dt * np.eye(3)
-        push = np.concatenate([0.5 * dt * dt * np.eye(3), dt * np.eye(3)])
+        move = _STAYS + dt * _MOVES
+        push = 0.5 * dt * dt * _STAYS[:, :3] + dt * _STAYS[:, 3:]
         # White acceleration of this standard deviation over a second, whatever the step.
         variance = self._config.subject_acceleration_m_s2**2 * np.array([1.0, 1.0, 0.1]) / max(dt, 1e-3)
         noise = push @ (variance[:, None] * push.T)
-        noise[:3, :3] += _DRIFT**2 * dt * np.eye(3)
+        noise[:3, :3] += _DRIFT**2 * dt * _STAYS[:3, :3]
         return move @ self._state, move @ self._covariance @ move.T + noise

@@ -112,11 +112,8 @@ def locate_subject(
     """
     if not observation.has_subject or len(observation.keypoints) == 0:
         return None
-    points, _, confidence = joint_map(observation.joints.name).apply(
-        observation.keypoints.astype(float),
-        observation.covariance.astype(float),
-        observation.confidence.astype(float),
-        float(observation.image_size[1]),
+    points, confidence = joint_map(observation.joints.name).places(
+        observation.keypoints.astype(float), observation.confidence.astype(float)
     )
     seen = np.isfinite(points).all(axis=1) & (confidence >= _CONFIDENCE)
     trunk = _TRUNK[seen[_TRUNK]]

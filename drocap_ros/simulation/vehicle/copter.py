@@ -63,7 +63,7 @@ class SimulatedCopter(ReportingCopter):
             self._t += dt
             self._failsafes()
             self._move(dt)
-            self.mount.step(self.body.orientation_xyzw(), dt)
+            self.mount.step(self.body.orientation_xyzw, dt)
             self.error.step(self._t > self.gps_lost_s, dt)
         if not self.crashed:
             self.step(t_s, data)
@@ -110,7 +110,7 @@ class SimulatedCopter(ReportingCopter):
             self._watch_setpoints()
         if self._t > min(self.ekf_failed_s + 1.0, self.gps_lost_s + EKF_NOTICED_S + 1.0) and self.mode != "LAND":
             self.set_mode("LAND", "failsafe: estimator")
-        if np.hypot(*self.estimate[:2]) > self.fence_m and self.mode not in ("RTL", "LAND"):
+        if self.fence_m < math.inf and np.hypot(*self.estimate[:2]) > self.fence_m and self.mode not in ("RTL", "LAND"):
             self.set_mode("RTL", "failsafe: fence")
 
     def _watch_setpoints(self) -> None:

@@ -76,6 +76,9 @@ class ReportingCopter(SimulatedVehicle):
         self._t = 0.0
         self._rng = np.random.default_rng([setup.seed, 0xC1])
         self._attitude_error = math.radians(setup.attitude_error_deg) * self._rng.standard_normal(3)
+        # The estimate of the body leans wrongly by as much as that of a gimbal.
+        lean = np.array([*(0.5 * self._attitude_error[:2]), 0.0, 1.0])
+        self._lean_error = lean / np.linalg.norm(lean)
         self._report: VehiclePose | None = None
         self._report_s = -1.0
 
@@ -101,15 +104,13 @@ class ReportingCopter(SimulatedVehicle):
         if self._report is not None and (self.frozen or t_s == self._report_s):
             return self._report
         self._report_s = t_s
-        # The estimate of the body leans wrongly by as much as that of a gimbal.
-        lean = np.array([*(0.5 * self._attitude_error[:2]), 0.0, 1.0])
-        body = quaternion_multiply(self.body.orientation_xyzw(), lean / np.linalg.norm(lean))
+        body = self.body.orientation_xyzw()
         self._report = VehiclePose(
             self.estimate,
             self.body.velocity + self.error.velocity,
-            body,
+            quaternion_multiply(body, self._lean_error),
             np.array([0.0, 0.0, self.body.yaw_rate]),
-            self.camera_orientation(),
+            self.mount.camera(body),
         )
         return self._report
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -48,11 +49,11 @@ class SimulatedMount:
             self.pitch = math.radians(min(max(pitch_deg, _LIMITS_DEG[0]), _LIMITS_DEG[1]))
         return self.kind != "fixed"
 
-    def step(self, body_xyzw: np.ndarray, dt: float) -> None:
-        """Let the servo turn for ``dt`` s; ``body_xyzw`` (4,) FLU -> ENU."""
+    def step(self, body_xyzw: Callable[[], np.ndarray], dt: float) -> None:
+        """Let the servo turn for ``dt`` s; ``body_xyzw`` (4,) FLU -> ENU, asked for by a servo alone."""
         if self.kind != "servo":
             return
-        demanded = self._demanded(body_xyzw)
+        demanded = self._demanded(body_xyzw())
         before = demanded if self._tilt is None else self._tilt
         self._tilt = before + (demanded - before) * (1 - math.exp(-dt / _SERVO_LAG_S))
 
