@@ -1,6 +1,6 @@
 """Start any subset of the nodes from one configuration, without ``ros2 launch``.
 
-    if __name__ == "__main__":  # with processes=True, as with every use of multiprocessing
+    if __name__ == "__main__":  # with processes=True and with lockstep, as with every use of multiprocessing
         with bringup(config, ["image_ingest", "pose_estimator", "session_recorder"]) as graph:
             graph.wait_finished("image_ingest", timeout_s=60)
 

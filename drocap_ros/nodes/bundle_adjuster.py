@@ -9,7 +9,6 @@ there is one.  With the camera's pose and a measured scale both are in ``map``, 
 
 from __future__ import annotations
 
-import math
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -44,6 +43,7 @@ from drocap_ros.ros.conversions import (
     window_to_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
+from drocap_ros.ros.own_process import OwnProcess
 from drocap_ros.ros.topics import TFMessage
 from drocap_ros.skeleton import BODY_15, BODY_17
 
@@ -76,8 +76,8 @@ class BundleAdjusterNode(ComponentNode):
     The period is counted in image stamps, so that a replay at another speed adjusts the same windows.  An adjustment
     ends after the step in which ``max_solve_s`` is over; after a slow one the next takes fewer images.  The message's
     ``stride`` and ``steps`` state both, its ``telemetry_stamp`` and ``background_stamp`` what was known.  In simulated
-    time an adjustment is never cut, and its result comes with the first image ``max_solve_s`` after the newest one of
-    its window.
+    time an adjustment has a process of its own and is never cut, and its result comes with the first image
+    ``max_solve_s`` after the newest one of its window.
     """
 
     component = "bundle_adjuster"
@@ -87,7 +87,8 @@ class BundleAdjusterNode(ComponentNode):
     def build(self) -> None:
         """Declare endpoints and state."""
         self._buffer = FrameBuffer(self.config)
-        self._adjuster = LiveAdjuster(self.config)
+        adjust = LiveAdjuster(self.config).adjust
+        self._adjust_window = OwnProcess(adjust) if self.simulated else adjust
         self._control = EffortControl(self.config.max_solve_s, self.config.max_stride)
         self._latest_pose = LatestPose(self.config.blend_s)
         self._latest_place = LatestPlace(self.config.blend_s)
@@ -123,6 +124,8 @@ class BundleAdjusterNode(ComponentNode):
     def close(self) -> None:
         """Wait for the running adjustment."""
         self._worker.shutdown(wait=True, cancel_futures=True)
+        if isinstance(self._adjust_window, OwnProcess):
+            self._adjust_window.close()
 
     def idle_reason(self) -> str:
         """Also: nobody to adjust, or too few images for a first adjustment."""
@@ -227,10 +230,10 @@ class BundleAdjusterNode(ComponentNode):
     def _adjust(self, window: Window, header: Header, track_id: int, known_ns: tuple[int, int], stride: int) -> _Solved:
         """Adjust a window in the worker, which in real time also publishes the result."""
         begin = time.perf_counter()
-        deadline = math.inf if self.simulated else begin + self.config.max_solve_s
+        late = None if self.simulated else lambda: time.perf_counter() > begin + self.config.max_solve_s
         result, failure = None, ""
         try:
-            result = self._adjuster.adjust(window, Effort(stride), lambda: time.perf_counter() > deadline)
+            result = self._adjust_window(window, Effort(stride), late)
         except SOLVER_ERRORS as error:
             failure = str(error)
         solved = _Solved(result, failure, header, track_id, known_ns, time.perf_counter() - begin)

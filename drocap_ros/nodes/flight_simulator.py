@@ -19,12 +19,12 @@ from pathlib import Path
 
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.perception.sources.image_files import encode_jpeg
 from drocap_ros.ros.component import OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at
 from drocap_ros.ros.diagnostics import PILOT_FLIES, PILOT_HANDS_OFF, Key
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.lockstep import STEP_S
+from drocap_ros.ros.own_process import OwnProcess
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import save_flight_truth
 from drocap_ros.simulation.flight_simulator.world import Exposure, FlightWorld
@@ -38,7 +38,7 @@ _STEP_S = 0.005
 class FlightSimulatorNode(ManagedComponent):
     """One thread flies and exposes, another renders: a slow image never delays the vehicle.
 
-    In simulated time a timer flies and exposes, and waits for the rendering.
+    In simulated time a timer flies and exposes, and waits for the rendering, which has a process of its own.
     """
 
     component = "flight_simulator"
@@ -51,7 +51,8 @@ class FlightSimulatorNode(ManagedComponent):
         self._world = FlightWorld(self.config, self.transport or open_transport(self.config.vehicle_url))
         width, height = self.config.image_width, self.config.image_height
         self._camera = CameraModel(width, height, self._world.camera_matrix)
-        self._renderer = Renderer(self._world.camera_matrix, width, height, self.config.seed)
+        jpeg = Renderer(self._world.camera_matrix, width, height, self.config.seed).jpeg
+        self._jpeg = OwnProcess(jpeg) if self.simulated else jpeg
         self._waiting: Exposure | None = None
         self._exposed = threading.Condition()
         self._stop = threading.Event()
@@ -81,6 +82,8 @@ class FlightSimulatorNode(ManagedComponent):
             if thread.is_alive():
                 thread.join(timeout=5.0)
         self._camera_thread.shutdown(cancel_futures=True)
+        if isinstance(self._jpeg, OwnProcess):
+            self._jpeg.close()
         self._world.close()
         if self.config.truth_file and self.counters[Key.EXPOSURES]:
             save_flight_truth(Path(self.config.truth_file), self._world.truth())
@@ -137,8 +140,7 @@ class FlightSimulatorNode(ManagedComponent):
             self._publish(exposure.stamp_ns, self._picture(exposure))
 
     def _picture(self, exposure: Exposure) -> bytes:
-        image = self._renderer.render(exposure.joints3d, exposure.rotation, exposure.position)
-        return encode_jpeg(image, self.config.jpeg_quality)
+        return self._jpeg(self.config.jpeg_quality, exposure.joints3d, exposure.rotation, exposure.position)
 
     def _publish(self, stamp_ns: int, jpeg: bytes) -> None:
         if self.active:

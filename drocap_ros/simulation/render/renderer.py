@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.perception.sources.image_files import encode_jpeg
 from drocap_ros.simulation.render.background import draw_background, draw_shadow
 from drocap_ros.simulation.render.body import Look, body, dress
 from drocap_ros.simulation.render.quadrics import Layer, Quadrics, rasterize
@@ -74,6 +75,10 @@ class Renderer:
         size = (self.width, self.height)
         image, _ = draw(self.scene, self.look, self.camera_matrix, size, joints, rotation, position)
         return image
+
+    def jpeg(self, quality: int, joints3d: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> bytes:
+        """The image of :meth:`render` as a JPEG file of this quality."""
+        return encode_jpeg(self.render(joints3d, rotation, position), quality)
 
 
 def draw(

@@ -1,0 +1,71 @@
+"""A function in a process of its own: threads of one Python process take turns, processes do not."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Generic, ParamSpec, TypeVar
+
+from drocap_ros.errors import NodeError
+from drocap_ros.reconstruction.common.threads import blas_threads
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+class OwnProcess(Generic[_P, _R]):
+    """A function, or a method whose object lives on there, with one BLAS thread: results are those of this process.
+
+    Parameters
+    ----------
+    call : with its object, its arguments and its results it can be pickled
+    """
+
+    def __init__(self, call: Callable[_P, _R]) -> None:
+        self._end, far_end = multiprocessing.Pipe()
+        context = multiprocessing.get_context("forkserver")  # a fork of this process would hold its threads' locks
+        self._process = context.Process(target=_serve, args=(far_end, call), daemon=True)
+        self._process.start()
+        far_end.close()  # so that the death of either process ends the other's wait
+
+    def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        """The result of a call, or its error; one thread calls at a time.
+
+        Raises
+        ------
+        NodeError
+            When the process has died.
+        """
+        result: _R
+        try:
+            self._end.send((args, kwargs))
+            result, error = self._end.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            raise NodeError(f"a process of this node ended with status {self._process.exitcode}") from None
+        if error is not None:
+            raise error
+        return result
+
+    def close(self) -> None:
+        """End the process after its last call."""
+        self._end.close()
+        self._process.join()
+
+
+def _serve(end: Connection, call: Callable[..., object]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the command
+    with end, blas_threads(1):
+        while True:
+            try:
+                args, kwargs = end.recv()
+            except EOFError:
+                return
+            answer: tuple[object, Exception | None]
+            try:
+                answer = call(*args, **kwargs), None
+            except Exception as error:  # noqa: BLE001 - whatever it is, the caller judges it
+                answer = None, error
+            end.send(answer)
