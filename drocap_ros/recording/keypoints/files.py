@@ -36,6 +36,7 @@ logger = logging.getLogger(__name__)
 
 #: Arrays of our own tracks files.
 _OWN = {"joints", "stamp_ns", "image_size"}
+_ARRAYS = (".npz", ".npy")
 #: Images per second, assumed where a file does not say.
 _USUAL_HZ = 30.0
 #: Coordinates that are all within the first are shares of the picture.  Scores beyond the second are no shares of one:
@@ -75,7 +76,8 @@ def as_tracks_file(path: Path, rate_hz: float | None, size: tuple[int, int] | No
 def read_keypoints(path: Path, rate_hz: float | None = None, size: tuple[int, int] | None = None) -> Tracks:
     """Tracks of a file of our own, or of the person in most frames of another tool's.
 
-    Without ``rate_hz`` and ``size`` (width, height) px these are the file's; else 30 and a person in the middle.
+    Without ``rate_hz`` and ``size`` (width, height) px these are the file's; else 30 and a person in the middle.  Where
+    the size is known, a network's file is of pictures of a lens.
 
     Raises
     ------
@@ -105,7 +107,7 @@ def _content(path: Path) -> Content | Tracks:
         walk(json.loads(path.read_bytes()), None, content)
     elif suffix == ".csv":
         walk(list(table(path)), None, content)
-    elif suffix in (".npz", ".npy"):
+    elif suffix in _ARRAYS:
         arrays = {"keypoints": np.load(path, allow_pickle=False)} if suffix == ".npy" else read_npz(path, ())
         if arrays.keys() >= _OWN:
             return load_tracks(path)
@@ -125,6 +127,9 @@ def _tracks(path: Path, content: Content, rate_hz: float | None, size: tuple[int
         if size is None:
             raise InputError("expected px, found shares of the picture; give its size with --image-size WxH")
         xy = xy * size
+    # Networks see pictures; arrays come from anywhere.  A guessed size of the picture gives no lens: where keypoints
+    # are of a part about the person, it would be far too short.
+    pictures = size is not None and path.suffix.lower() not in _ARRAYS
     assumed = [] if rate_hz else [f"{_USUAL_HZ:g} images per second (--rate HZ)"]
     if size is None:
         middle, end = np.nanmedian(xy, axis=(0, 1)), np.nanmax(xy, axis=(0, 1))
@@ -138,6 +143,7 @@ def _tracks(path: Path, content: Content, rate_hz: float | None, size: tuple[int
         stamp_ns=np.round((frames - frames[0]) * (1e9 / (rate_hz or _USUAL_HZ))).astype(np.int64),
         image_size=(size[0], size[1]),
         confidence=np.clip(scores, 0.0, 1.0),
+        real_lens=pictures,
     )
 
 

@@ -149,6 +149,7 @@ def test_every_form_gives_the_same_tracks(tmp_path, form):
     step_s = np.diff(found.stamp_ns) * 1e-9
     assert step_s == pytest.approx(10 / 15 if form is mmpose else 1 / 15, rel=1e-6)
     assert found.image_size == SIZE
+    assert found.real_lens == (form not in (with_scores, rate_only, bare_array))
 
 
 @pytest.mark.parametrize("form", [alphapose, openpose, deeplabcut, bare_array])
@@ -167,6 +168,7 @@ def test_what_a_file_does_not_say_is_assumed_aloud(tmp_path, caplog):
     found = read_keypoints(alphapose(tmp_path, walk(), walk()))
     assert "assumed: 30 images per second" in caplog.text
     assert (found.keypoints <= found.image_size).all()
+    assert not found.real_lens
 
 
 def test_frames_without_a_person_stay_frames(tmp_path):
