@@ -10,8 +10,6 @@ Quaternions are x y z w (ROS); MAVLink's are w x y z.  Arrays may have any leadi
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, quaternion_multiply
@@ -70,10 +68,16 @@ def optical_orientation(camera_flu_to_enu: np.ndarray) -> np.ndarray:
     return orientation
 
 
-def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.ndarray:
-    """(4,) x y z w of MAVLink's angles: yaw about down, then pitch, then roll; rotation body FRD -> NED."""
-    halves = 0.5 * roll_rad, 0.5 * pitch_rad, 0.5 * yaw_rad
-    (cr, cp, cy), (sr, sp, sy) = map(math.cos, halves), map(math.sin, halves)
+def quaternion_from_euler(
+    roll_rad: float | np.ndarray, pitch_rad: float | np.ndarray, yaw_rad: float | np.ndarray
+) -> np.ndarray:
+    """(4,) x y z w of MAVLink's angles: yaw about down, then pitch, then roll; rotation body FRD -> NED.
+
+    (4, N) of arrays (N,).
+    """
+    half = 0.5 * np.array([roll_rad, pitch_rad, yaw_rad])
+    cosine, sine = np.cos(half), np.sin(half)
+    (cr, cp, cy), (sr, sp, sy) = (cosine.tolist(), sine.tolist()) if half.ndim == 1 else (cosine, sine)
     return np.array(
         [
             sr * cp * cy - cr * sp * sy,

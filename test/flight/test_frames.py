@@ -51,6 +51,8 @@ def test_euler_angles_and_product_equal_scipy():
         theirs = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_quat()
         assert np.isclose(abs(ours @ theirs), 1.0)
         assert np.isclose(frames.yaw_of(ours), yaw)
+    one_by_one = [frames.quaternion_from_euler(*row) for row in angles]
+    np.testing.assert_allclose(frames.quaternion_from_euler(*angles.T).T, one_by_one, atol=1e-15)
     ours = quaternion_multiply(Q, Q[::-1])
     theirs = (Rotation.from_quat(Q) * Rotation.from_quat(Q[::-1])).as_quat()
     assert np.allclose(np.abs(np.sum(ours * theirs, axis=1)), 1.0)
