@@ -24,6 +24,7 @@ from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_r
 from drocap_ros.ros.diagnostics import PILOT_FLIES, PILOT_HANDS_OFF, Key
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.lockstep import STEP_S
+from drocap_ros.ros.look_ahead import LooksAhead
 from drocap_ros.ros.own_process import OwnProcess
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import save_flight_truth
@@ -110,7 +111,11 @@ class FlightSimulatorNode(ManagedComponent):
         now_ns, latency_ns = self.now_ns(), round(self.config.latency_s * 1e9)
         while (stamp_ns := self._begin_ns + round(self.counters[Key.EXPOSURES] / self.config.rate_hz * 1e9)) < now_ns:
             self._world.step((stamp_ns - self._begin_ns) * 1e-9)
-            self._pending.append((stamp_ns, self._camera_thread.submit(self._picture, self._world.expose(stamp_ns))))
+            picture = self._camera_thread.submit(self._picture, self._world.expose(stamp_ns))
+            self._pending.append((stamp_ns, picture))
+            for node in self.beside.values():
+                if isinstance(node, LooksAhead):
+                    node.expect(stamp_ns, picture)
             self.count(Key.EXPOSURES)
         self._world.step((now_ns - self._begin_ns) * 1e-9)
         while self._pending and self._pending[0][0] + latency_ns <= now_ns:

@@ -7,10 +7,10 @@ image's header.
 
 from __future__ import annotations
 
-from functools import partial
+from concurrent.futures import Future
 
 import numpy as np
-from sensor_msgs.msg import RegionOfInterest
+from sensor_msgs.msg import CompressedImage, RegionOfInterest
 
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
@@ -22,11 +22,18 @@ from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.image_input import ImageInput, ImageSample
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.load_level import LoadShedding
+from drocap_ros.ros.look_ahead import LookAhead
 from drocap_ros.ros.topics import TOPICS
+
+#: Stands for an image whose subject is known already.
+_NOT_NEEDED = np.empty((0, 0, 3), np.uint8)
 
 
 class PoseEstimatorNode(ManagedComponent):
-    """Runs detection, subject tracking and 2D pose on images, with less work for each while they queue."""
+    """Runs detection, subject tracking and 2D pose on images, with less work for each while they queue.
+
+    In simulated time a process of its own looks at them between their exposure and their publication.
+    """
 
     component = "pose_estimator"
     config: PoseEstimatorConfig
@@ -36,12 +43,11 @@ class PoseEstimatorNode(ManagedComponent):
         """Declare endpoints and state."""
         self._estimator: PoseEstimator | None = None
         self._roi: np.ndarray | None = None
+        self._ahead: LookAhead | None = None
         self._load_shedding = LoadShedding(self.config.max_load_level)
         self._pose2d = self.output("pose2d")
         self._background = self.output("background")
-        self._images = ImageInput(
-            self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
-        )
+        self._images = ImageInput(self, self._on_image, self._decoded, TOPICS["image/compressed"].qos.depth)
         self.input("roi", self._on_roi)
 
     def acquire(self) -> None:
@@ -54,7 +60,25 @@ class PoseEstimatorNode(ManagedComponent):
     def release(self) -> None:
         """Drop the networks and the subject."""
         self._images.wait_idle()
+        self._end_ahead()
         self._estimator, self._roi = None, None
+
+    def expect(self, stamp_ns: int, jpeg: Future[bytes]) -> None:
+        """Look at a picture that will be published."""
+        if self.active:
+            self._ahead = self._ahead or LookAhead(self.config)
+            roi, self._roi = self._roi, None
+            self._ahead.begin(stamp_ns, jpeg, roi)
+
+    def _end_ahead(self) -> None:
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None:
+            ahead.close()
+
+    def _decoded(self, message: CompressedImage) -> np.ndarray:
+        if self._ahead is not None and self._ahead.knows(stamp_from_ros(message.header.stamp)):
+            return _NOT_NEEDED
+        return image_from_message(message, compressed=True)
 
     def _on_roi(self, message: RegionOfInterest) -> None:
         x, y = message.x_offset, message.y_offset
@@ -68,13 +92,16 @@ class PoseEstimatorNode(ManagedComponent):
     def close(self) -> None:
         """Process no more images."""
         self._images.close()
+        self._end_ahead()
 
     def _on_image(self, sample: ImageSample) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
         level = self._load_shedding.level(self.now_s(), sample.waited, sample.behind)
-        roi, self._roi = self._roi, None
-        header = sample.header
-        observation = self._estimator.process(sample.image, stamp_from_ros(header.stamp), roi, level)
+        header, stamp_ns = sample.header, stamp_from_ros(sample.header.stamp)
+        observation = None if self._ahead is None else self._ahead.take(stamp_ns)
+        if observation is None:
+            roi, self._roi = self._roi, None
+            observation = self._estimator.process(sample.image, stamp_ns, roi, level)
         if level:
             self.count(Key.IMAGES_SHED)
         if self._estimator.propagated:
