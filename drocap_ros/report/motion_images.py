@@ -32,7 +32,8 @@ MAX_BYTES = 8_000_000  # bytes; mail often ends at 10 MB
 _LONG_SIDE = 640
 #: How an image is compressed, the best first: at a share of that size and a quality.
 _STEPS = tuple((share, quality) for share in (1, 2, 4) for quality in (75, 60, 45, 30))
-#: Growth of the bytes by a step up, of three videos at least 1.13: a step that cannot fit is not tried.
+#: Growth of the bytes by a step up, of three videos at least 1.13, until a video has shown its own: a step that cannot
+#: fit is not tried.
 _GROWTH = 1.12
 #: Margin of the crop, as a share of its size.
 _MARGIN = 0.12
@@ -290,14 +291,17 @@ class _Encoder:
         self._size = (max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale)))
         self._most = int(MAX_BYTES * 0.75 / count)
         self._step = 0  # of the last image: the next one takes hardly more or fewer bytes
+        self._growth = [_GROWTH] * len(_STEPS)  # of the bytes from each step to the better one, in the last try
 
     def __call__(self, image: np.ndarray) -> bytes:
         """JPEG of an image (H, W, 3) uint8 BGR: of the best step that fits."""
         x0, y0, x1, y1 = self.box
         small = shrink(image[y0:y1, x0:x1], self._size)
         data = self._compressed(small, self._step)
-        while len(data) * _GROWTH <= self._most and self._step:
-            if len(better := self._compressed(small, self._step - 1)) > self._most:
+        while len(data) * self._growth[self._step] <= self._most and self._step:
+            better = self._compressed(small, self._step - 1)
+            self._growth[self._step] = len(better) / len(data)
+            if len(better) > self._most:
                 break
             data, self._step = better, self._step - 1
         while len(data) > self._most and self._step < len(_STEPS) - 1:
