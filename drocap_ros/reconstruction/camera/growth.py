@@ -125,7 +125,8 @@ class Growth:
         height, falls = self._eye @ ground.up - ground.level, -self._ray @ ground.up
         lying = (self._count > 0) & flat & (height > 0.0) & (falls > 1.0 / _FARTHEST_GROUND)
         away = (height[lying] / falls[lying])[:, None]
-        self.places[lying], self.usable[lying] = self._eye[lying] + away * self._ray[lying], True
+        # Rays from one place meet there: other points without depth would hold the camera fast.
+        self.places[lying], self.usable[flat] = self._eye[lying] + away * self._ray[lying], lying[flat]
         return self.extend()
 
     def _next_keys(self) -> list[int]:

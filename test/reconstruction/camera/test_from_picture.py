@@ -69,21 +69,34 @@ def test_camera_that_follows_slowly_is_found_without_parallax_to_begin_with() ->
     assert shape_error(found.position, scene.position) < 0.05
 
 
-@pytest.mark.parametrize("seed", [6, 9, 15])
-def test_path_goes_on_over_the_ground_where_a_camera_hovers(seed: int) -> None:
+def climbing_and_hovering(points: np.ndarray, sway_m: float) -> Scene:
     position = np.concatenate([np.zeros((54, 3)), orbit(FRAMES, FPS)[1]])
     sway = 2 * np.pi * np.arange(30) / 30
     position[:, 2] = 2.5
     position[:54, :2] = position[54, :2]
     position[:24, 2] = np.linspace(0.8, 2.5, 24)
-    position[24:54, :2] += 0.05 * np.stack([np.sin(2 * sway), np.sin(sway)], axis=1)
+    position[24:54, :2] += sway_m * np.stack([np.sin(2 * sway), np.sin(sway)], axis=1)
     rotation = looking(position, np.tile([0.0, 0.0, 0.9], (len(position), 1)))
-    # Few points, and none that is seen before and after the pause.
-    scene = seen(rotation, position, points_of(np.random.default_rng(seed), 400, flat=True), FPS, longest_s=1.5)
+    # None of the points is seen before and after the pause.
+    return seen(rotation, position, points, FPS, longest_s=1.5)
+
+
+@pytest.mark.parametrize("seed", [6, 9, 15])
+def test_path_goes_on_over_the_ground_where_a_camera_hovers(seed: int) -> None:
+    scene = climbing_and_hovering(points_of(np.random.default_rng(seed), 400, flat=True), 0.05)
     found = camera_of(scene, noise_px=0.3)
     assert found.kind is Kind.MOVES
     assert found.covered > 0.95
     assert shape_error(found.position, scene.position) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_far_things_do_not_hold_a_hovering_camera_fast(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    away, angle = rng.uniform(40.0, 200.0, 100), rng.uniform(0.0, 2 * np.pi, 100)
+    far = away[:, None] * np.stack([np.cos(angle), np.sin(angle), rng.uniform(0.0, 0.15, 100)], axis=1)
+    scene = climbing_and_hovering(np.concatenate([points_of(rng, 400, flat=True), far]), 0.01)
+    assert shape_error(camera_of(scene, noise_px=0.3).position, scene.position) < 0.1
 
 
 @pytest.mark.parametrize("noise_px", [0.3, 0.62])
