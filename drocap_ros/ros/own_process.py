@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import signal
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from drocap_ros.reconstruction.common.threads import blas_threads
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_log = logging.getLogger("drocap_ros")
 
 
 class OwnProcess(Generic[_P, _R]):
@@ -21,12 +23,14 @@ class OwnProcess(Generic[_P, _R]):
     Parameters
     ----------
     call : with its object, its arguments and its results it can be pickled
+
+    The package's messages are those of the level that this process has now.
     """
 
     def __init__(self, call: Callable[_P, _R]) -> None:
         self._end, far_end = multiprocessing.Pipe()
         context = multiprocessing.get_context("forkserver")  # a fork of this process would hold its threads' locks
-        self._process = context.Process(target=_serve, args=(far_end, call), daemon=True)
+        self._process = context.Process(target=_serve, args=(far_end, call, _log.level), daemon=True)
         self._process.start()
         far_end.close()  # so that the death of either process ends the other's wait
 
@@ -55,7 +59,8 @@ class OwnProcess(Generic[_P, _R]):
         self._process.join()
 
 
-def _serve(end: Connection, call: Callable[..., object]) -> None:
+def _serve(end: Connection, call: Callable[..., object], level: int) -> None:
+    _log.setLevel(level)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the command
     with end, blas_threads(1):
         while True:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 
@@ -27,6 +28,11 @@ class Sum:
         return self.value, os.getpid()
 
 
+def warn():
+    """Logs a warning of the package."""
+    logging.getLogger("drocap_ros.test").warning("said there")
+
+
 @pytest.fixture
 def add():
     process = OwnProcess(Sum(10).add)
@@ -49,6 +55,15 @@ def test_an_error_comes_back_and_the_object_goes_on(add):
 def test_the_terminals_interruption_does_not_end_it(add):
     os.kill(add(0)[1], signal.SIGINT)
     assert add(1)[0] == 11
+
+
+@pytest.mark.parametrize("level", [logging.WARNING, logging.ERROR])
+def test_messages_that_this_process_leaves_out_are_left_out_there(level, monkeypatch, capfd):
+    monkeypatch.setattr(logging.getLogger("drocap_ros"), "level", level)
+    process = OwnProcess(warn)
+    process()
+    process.close()
+    assert ("said there" in capfd.readouterr().err) is (level == logging.WARNING)
 
 
 def test_its_death_is_an_error_of_the_node(add):
