@@ -29,7 +29,8 @@ class OwnProcess(Generic[_P, _R]):
 
     def __init__(self, call: Callable[_P, _R]) -> None:
         self._end, far_end = multiprocessing.Pipe()
-        context = multiprocessing.get_context("forkserver")  # a fork of this process would hold its threads' locks
+        # A fork of this process would hold its threads' locks; the server of forks is for nodes (``processes.py``).
+        context = multiprocessing.get_context("spawn")
         self._process = context.Process(target=_serve, args=(far_end, call, _log.level), daemon=True)
         self._process.start()
         far_end.close()  # so that the death of either process ends the other's wait
