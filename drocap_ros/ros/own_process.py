@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import multiprocessing
 import signal
@@ -63,12 +64,9 @@ class OwnProcess(Generic[_P, _R]):
 def _serve(end: Connection, call: Callable[..., object], level: int) -> None:
     _log.setLevel(level)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the command
-    with end, blas_threads(1):
+    with end, blas_threads(1), contextlib.suppress(EOFError, OSError):  # until the other end is closed, or has died
         while True:
-            try:
-                args, kwargs = end.recv()
-            except EOFError:
-                return
+            args, kwargs = end.recv()
             answer: tuple[object, Exception | None]
             try:
                 answer = call(*args, **kwargs), None
