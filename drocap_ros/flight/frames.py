@@ -71,10 +71,7 @@ def optical_orientation(camera_flu_to_enu: np.ndarray) -> np.ndarray:
 def quaternion_from_euler(
     roll_rad: float | np.ndarray, pitch_rad: float | np.ndarray, yaw_rad: float | np.ndarray
 ) -> np.ndarray:
-    """(4,) x y z w of MAVLink's angles: yaw about down, then pitch, then roll; rotation body FRD -> NED.
-
-    (4, N) of arrays (N,).
-    """
+    """(4,), or (4, N), x y z w of MAVLink's angles: yaw about down, then pitch, then roll; rotation body FRD -> NED."""
     half = 0.5 * np.array([roll_rad, pitch_rad, yaw_rad])
     cosine, sine = np.cos(half), np.sin(half)
     (cr, cp, cy), (sr, sp, sy) = (cosine.tolist(), sine.tolist()) if half.ndim == 1 else (cosine, sine)

@@ -12,6 +12,7 @@ from drocap_ros.skeleton import BODY_15, BODY_17
 #: Standard deviation over the box height, per kind of joint (detectors are worst at the ends of the limbs).
 _SPREAD = {"pelvis": 0.007, "hip": 0.008, "knee": 0.007, "ankle": 0.010, "neck": 0.006, "head": 0.006, "toe": 0.010}
 _SPREAD |= {"shoulder": 0.006, "elbow": 0.008, "wrist": 0.011}
+_SPREAD_OF = {name: _SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] for name in BODY_17.joints}
 #: Correlation of the noise of one image with that of the previous one.
 _CORRELATION = 0.6
 #: Radius of a limb that occludes.
@@ -129,8 +130,7 @@ def _noisy(
 
     noise_scale, outlier_fraction, missed_fraction = rates
     frames, joints = px.shape[:2]
-    share = np.array([_SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] for name in names])
-    sigma = height[:, None] * share * np.where(hidden, _OCCLUDED_NOISE, 1.0)
+    sigma = height[:, None] * np.array([_SPREAD_OF[name] for name in names]) * np.where(hidden, _OCCLUDED_NOISE, 1.0)
     white = rng.standard_normal((frames, joints, 2))
     white[1:] *= np.sqrt(1 - _CORRELATION**2)
     noise = lfilter([1.0], [1.0, -_CORRELATION], white, axis=0) if frames > 1 else white

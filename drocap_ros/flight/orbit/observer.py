@@ -198,7 +198,9 @@ def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: Veh
     flies = vehicle_type in _MULTIROTORS
     # The state is at the attitude's stamp; a moment later the vehicle is a little farther.
     moved_s = min(max(age_s, 0.0), _MAX_EXTRAPOLATION_S)
-    position = vehicle.position_enu_m + np.nan_to_num(vehicle.velocity_enu_m_s) * moved_s
+    velocity = vehicle.velocity_enu_m_s
+    moves = velocity if np.isfinite(velocity).all() else np.nan_to_num(velocity)
+    position = vehicle.position_enu_m + moves * moved_s
     position_age_s = max((now_ns - estimator.position_changed_ns) / NS, estimator.position_behind_s() + abs(age_s))
     return Observed(
         autopilot=autopilot if flies else UNKNOWN,
@@ -231,7 +233,7 @@ def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: Veh
         ),
         vehicle=Motion(
             position=position,
-            velocity=np.asarray(vehicle.velocity_enu_m_s, float),
+            velocity=np.asarray(velocity, float),
             yaw=_yaw(vehicle),
             height_m=float(position[2]) - config.ground_height_m,
             age_s=abs(age_s),

@@ -122,7 +122,8 @@ def locate_subject(
     plane = (np.where(seen[:, None], points, 0.0) - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2]
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) @ camera.rotation
     # The median of pelvis and hips: one wrong joint does not turn the bearing.
-    pelvis = np.median(rays[trunk[trunk != _NECK]], axis=0) if np.any(trunk != _NECK) else rays[_NECK]
+    hips = np.sort(rays[trunk[trunk != _NECK]], axis=0)
+    pelvis = 0.5 * (hips[(len(hips) - 1) // 2] + hips[len(hips) // 2]) if len(hips) else rays[_NECK]
     length = float(np.linalg.norm(pelvis))
     flat = float(np.hypot(pelvis[0], pelvis[1]))
     if flat < np.sqrt(1 - _STEEP**2) * length:
@@ -139,7 +140,7 @@ def locate_subject(
         sd, noise = 2 * size_error * distance, np.nan
     if not 0.3 < distance < _MAX_RANGE_M:
         return None
-    nearer = 1.0 - float(np.nanmin([steady, ground])) / distance
+    nearer = 1.0 - float(np.fmin(steady, ground)) / distance
     ahead = np.array([pelvis[0], pelvis[1], 0.0]) / flat
     position = camera.position + distance * (pelvis / flat)
     aside = np.array([-ahead[1], ahead[0], 0.0])
