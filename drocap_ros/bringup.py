@@ -33,12 +33,12 @@ from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.graph import Graph, Runner
 from drocap_ros.ros.lockstep import Lockstep
+from drocap_ros.ros.own_process import environment
 from drocap_ros.ros.processes import (
     DEFAULT_NAMESPACE,
     STOP_TIMEOUT_S,
     LaunchContext,
     NodeProcess,
-    environment,
     node_class,
     remaps,
 )

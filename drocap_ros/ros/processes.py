@@ -19,6 +19,7 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
+from drocap_ros.ros.own_process import LEAN, environment
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import component_of, section_of
 
@@ -27,16 +28,6 @@ from drocap_ros.ros.topics import component_of, section_of
 DEFAULT_NAMESPACE = "/drocap"
 #: Above the drain time of a node, and the time that its files may take to close.
 STOP_TIMEOUT_S = 20.0
-#: One BLAS thread: the matrices of a node are small.  Two arenas, since each of the middleware's many threads would
-#: fragment one of its own over hours; freed memory is kept, since new pages cost time.
-_LEAN = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "OPENCV_FOR_THREADS_NUM": "1",
-    "MALLOC_ARENA_MAX": "2",
-    "MALLOC_TRIM_THRESHOLD_": str(1 << 28),
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
-}
 _FORKSERVER = multiprocessing.get_context("forkserver")
 
 
@@ -52,14 +43,14 @@ class LaunchContext:
         self.folder = folder
         self.ros_arguments = ["--ros-args", "-r", f"__ns:={namespace}", "--disable-stdout-logs"]
         self.namespace = namespace
-        self.environment = {**_LEAN, **os.environ, "ROS_DOMAIN_ID": str(domain_id)}
+        self.environment = {**LEAN, **os.environ, "ROS_DOMAIN_ID": str(domain_id)}
         # The server of this Python process serves all its graphs; it has no thread besides those of LTTng, which its
         # forks do not need.
         solvers = ["scipy.linalg.lapack", "scipy.ndimage"] if "bundle_adjuster" in names else []
         _FORKSERVER.set_forkserver_preload([*(f"drocap_ros.nodes.{component_of(name)[0]}" for name in names), *solvers])
         path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
         resource_tracker.ensure_running()  # which unblocks the signal
-        with environment({**_LEAN, **os.environ, "PYTHONPATH": path}), _blocked(signal.SIGTERM):
+        with environment({**LEAN, **os.environ, "PYTHONPATH": path}), _blocked(signal.SIGTERM):
             ensure_running()
 
     def parameter_file(self, name: str, config: DrocapConfig, restarted: bool) -> Path:
@@ -168,18 +159,3 @@ def node_class(name: str) -> type[ComponentNode]:
         if isinstance(value, type) and issubclass(value, ComponentNode) and value.__dict__.get("component") == component
     )
     return found
-
-
-@contextlib.contextmanager
-def environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Environment variables of this process while the context lasts."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
