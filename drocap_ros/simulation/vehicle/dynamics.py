@@ -14,6 +14,7 @@ from drocap_ros.flight.autopilot.simulated import Airframe
 _YAW_LAG_S = 0.1  # this and the next three: fitted to recorded orbits in 0 and 8 m/s of wind
 _MAX_YAW_RATE = 1.6  # rad/s
 _GUST = 0.09  # share of the wind
+_GUST_AXES = np.array([1.0, 1.0, 0.2])  # it blows along the ground
 _GUST_TURN = 0.27  # rad/s of yaw per m/s of lateral gust
 
 
@@ -49,7 +50,7 @@ class Body:
         if wind > 0:
             decay = math.exp(-dt / 1.5)
             strength = self._gustiness * wind * math.sqrt(1 - decay**2)
-            self._gust = decay * self._gust + strength * self._rng.standard_normal(3) * np.array([1, 1, 0.2])
+            self._gust = decay * self._gust + strength * self._rng.standard_normal(3) * _GUST_AXES
         self.acceleration = self.thrust + self.drag()
         self.position = self.position + self.velocity * dt + 0.5 * self.acceleration * dt * dt
         self.velocity = self.velocity + self.acceleration * dt

@@ -28,17 +28,18 @@ class EstimateError:
         self._part = 0.0
         for _ in range(_SETTLED):
             self._advance()
+        self._between: np.ndarray = self._before  # (3, 2) of position and velocity per axis, now
 
     @property
     def position(self) -> np.ndarray:
         """(3,) m, estimate less truth."""
-        error: np.ndarray = self._between()[:, 0] + self.glitch
+        error: np.ndarray = self._between[:, 0] + self.glitch
         return error
 
     @property
     def velocity(self) -> np.ndarray:
         """(3,) m/s, estimate less truth."""
-        return self._between()[:, 1]
+        return self._between[:, 1]
 
     def step(self, dead_reckoning: bool, dt: float) -> None:
         """Advance by ``dt`` seconds; without satellites it drifts away."""
@@ -46,6 +47,7 @@ class EstimateError:
         while self._part >= 1.0:
             self._part -= 1.0
             self._advance()
+        self._between = (1.0 - self._part) * self._before + self._part * self._now
         if dead_reckoning:
             self.glitch = self.glitch + _DEAD_RECKONING_M_S * dt
 
@@ -56,8 +58,3 @@ class EstimateError:
         after = self._first[:, :, 0] * now[:, :1] + self._first[:, :, 1] * now[:, 1:]
         after = after + self._second[:, :, 0] * before[:, :1] + self._second[:, :, 1] * before[:, 1:]
         self._now, self._before = after + self._noise * noise, now
-
-    def _between(self) -> np.ndarray:
-        """(3, 2) position and velocity per axis, interpolated from the step before to the last one."""
-        between: np.ndarray = (1.0 - self._part) * self._before + self._part * self._now
-        return between
