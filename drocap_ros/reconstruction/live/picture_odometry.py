@@ -5,8 +5,8 @@ on with it: new keyframes are placed by its points, as a path grows offline, and
 their camera.  They need not be the same images: a late adjustment takes every second to fourth.  Where that fails, the
 path is lost, and another one begins at the last place and heading of the camera.
 
-A path begins in a few seconds, in which a drone hovers or climbs, and feet tell its metres badly.  Where those of a
-later window contradict them, the path takes over theirs.
+A path begins in a few seconds, in which a drone hovers or climbs: its up and its metres are badly known.  Where ground
+and feet of a later window contradict them, the path takes over theirs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from drocap_ros.contacts import ANKLES
 from drocap_ros.geometry.interpolation import interpolate
-from drocap_ros.geometry.rotations import hat, matrix_from_quaternion, project_to_so3, quaternion_from_matrix
+from drocap_ros.geometry.rotations import exp_so3, hat, matrix_from_quaternion, project_to_so3, quaternion_from_matrix
 from drocap_ros.reconstruction.camera.from_picture import fits
 from drocap_ros.reconstruction.camera.fusion import joints_by_camera
 from drocap_ros.reconstruction.camera.growth import Grown, Growth, adjusted, turns
@@ -31,7 +31,7 @@ from drocap_ros.reconstruction.camera.picture_world import (
     with_camera,
 )
 from drocap_ros.reconstruction.camera.sightings import Sightings
-from drocap_ros.reconstruction.camera.upright import FEET_TELL, LEAST_SCALE_STD, by_contacts
+from drocap_ros.reconstruction.camera.upright import FEET_TELL, LEAST_SCALE_STD, UpSource, by_contacts, set_upright
 from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
@@ -52,6 +52,10 @@ _STEPS = 5
 _PLACE_M = 0.02
 #: Longest time (s) between images of a window over which its path is straight.
 _STRAIGHT_S = 0.5
+#: Tilt (degrees) of a path from which the ground of a window contradicts it: three deviations of up by ground.
+_TILTED_DEG = 1.5
+#: Logarithm of a factor of two, above which feet contradict a path that hardly moves.
+_MOST_SCALE = 0.7
 #: Time (s) at a window's end in which a keyframe has to be placed.
 _NEWEST_S = 0.5
 
@@ -74,7 +78,7 @@ class PicturePath:
 
     tracks : with the camera; world : how it was found, with up, metres and their deviations; number : of the path
     begun_ns : stamp of the path's first image; drift_m, drift_rad : deviation of place and turn within a second
-    subject : whose assumed stature gives its metres; rescaled : how often it has taken over those of a later window
+    subject : whose assumed stature gives its metres; corrections : how often a later window has told them, and up, anew
     """
 
     tracks: Tracks
@@ -84,7 +88,7 @@ class PicturePath:
     drift_m: float
     drift_rad: float
     subject: int
-    rescaled: int = 0
+    corrections: int = 0
 
     @property
     def words(self) -> str:
@@ -116,11 +120,9 @@ class PictureOdometry:
         before, stamps = self._path, tracks.stamp_ns
         if before is not None:
             shared = stamps[0] <= before.tracks.stamp_ns[-1]
-            self._path = _continued(before, tracks) if shared else None
+            self._path = _continued(before, tracks, person) if shared else None
             if self._path is None:
                 self._lose(before, tracks, shared)
-            else:
-                self._path = _in_metres(self._path, person)
         long = stamps[-1] - stamps[0] >= _FIRST_S * 1e9
         if self._path is None and self.since_ns <= stamps[0] and self._retry.due(int(stamps[-1])) and long:
             self._path = self._begun(tracks, person, config)
@@ -208,19 +210,20 @@ def _held(last: Tracks, stamp_ns: np.ndarray) -> _Held:
     return _Held(inside[known], matrix_from_quaternion(turn[known]), place[known])
 
 
-def _continued(before: PicturePath, tracks: Tracks) -> PicturePath | None:
+def _continued(before: PicturePath, tracks: Tracks, person: Person) -> PicturePath | None:
     """The path of the window before in a window that shares time with it; None = it is lost."""
     last, seen, held = before.tracks, _Seen(tracks), _held(before.tracks, tracks.stamp_ns)
     if cut_at(seen.sightings) is not None or not len(held.image):
         return None
-    found = _grown(seen, last, held) if before.world.camera.kind is Kind.MOVES else None
-    if found is None:
-        found = _in_place(seen, last)
+    tracks = replace(tracks, camera_matrix=last.camera_matrix)
+    grown = _grown(seen, last, held) if before.world.camera.kind is Kind.MOVES else None
+    found = _in_place(seen, last) if grown is None else grown[:2]
     if found is None:
         return None
     rotation, position = _as_before(*found, held)
-    tracks = replace(tracks, camera_rotation=rotation, camera_position=position, camera_matrix=last.camera_matrix)
-    return replace(before, tracks=tracks)
+    path = replace(before, tracks=replace(tracks, camera_rotation=rotation, camera_position=position))
+    # Another person's stature follows from the metres that the path has.
+    return path if grown is None or person.subject != before.subject else _corrected(path, grown, person)
 
 
 def _in_place(seen: _Seen, last: Tracks) -> tuple[np.ndarray, np.ndarray] | None:
@@ -232,8 +235,8 @@ def _in_place(seen: _Seen, last: Tracks) -> tuple[np.ndarray, np.ndarray] | None
     return (turns(seen.sightings, last.camera_matrix)[0][seen.slot], place) if kind is Kind.TURNS else None
 
 
-def _grown(seen: _Seen, last: Tracks, held: _Held) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rotations and positions (F,) of a path that goes on, in a unit of its own; None = its points do not carry it."""
+def _grown(seen: _Seen, last: Tracks, held: _Held) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Rotations, positions (F,) and points (J, 4) of a path that goes on, in a unit of its own; None = it does not."""
     assert last.camera_matrix is not None
     image = seen.image[seen.knots.frame]
     known = np.isin(image, held.image)
@@ -252,7 +255,7 @@ def _grown(seen: _Seen, last: Tracks, held: _Held) -> tuple[np.ndarray, np.ndarr
         return None
     keys = seen.knots.frame[path.known]
     at = np.clip(seen.slot, keys[0], keys[-1]) - keys[0]
-    return found.rotation[at], found.position[at]
+    return found.rotation[at], found.position[at], found.points
 
 
 def _as_before(rotation: np.ndarray, position: np.ndarray, held: _Held) -> tuple[np.ndarray, np.ndarray]:
@@ -267,26 +270,40 @@ def _as_before(rotation: np.ndarray, position: np.ndarray, held: _Held) -> tuple
     return rotation @ turn.T, moved
 
 
-def _in_metres(path: PicturePath, person: Person) -> PicturePath:
-    """The path in the metres at which the window's feet rest, where its own contradict them; the person stays in place.
+def _corrected(path: PicturePath, grown: tuple[np.ndarray, np.ndarray, np.ndarray], person: Person) -> PicturePath:
+    """The path in the metres at which the window's feet rest, and upright by its ground, where its own contradict them.
 
-    Another person's stature follows from the metres that the path has.
+    The person stays in place.
     """
     tracks, upright = path.tracks, path.world.upright
     rotation, position = tracks.camera_rotation, tracks.camera_position
     assert rotation is not None
     assert position is not None
     assert upright is not None
-    if person.subject != path.subject or not np.ptp(position, axis=0).any():
+    seen = seen_from_camera(tracks, person.poses, person.metres_per_px(tracks))
+    scale = by_contacts((seen @ rotation)[:, ANKLES], position, tracks.stamp_ns)
+    fresh = set_upright(*grown, seen, tracks.stamp_ns)
+    factor, turn = 1.0, np.eye(3)
+    if scale is not None and scale.std < FEET_TELL and LEAST_SCALE_STD < abs(np.log(scale.factor)) < _MOST_SCALE:
+        factor = scale.factor
+        upright = upright._replace(scale_std=max(scale.std, LEAST_SCALE_STD))
+    up = rotation[-1].T @ fresh.rotation[-1, :, 2]
+    tilt = np.arccos(np.clip(up[2], -1.0, 1.0))
+    if fresh.source is UpSource.GROUND and tilt > np.deg2rad(_TILTED_DEG):
+        across = np.cross(up, [0.0, 0.0, 1.0])
+        turn = exp_so3(tilt * across / np.linalg.norm(across))
+        upright = upright._replace(source=fresh.source, std_deg=fresh.std_deg)
+    if upright is path.world.upright:
         return path
-    joints = seen_from_camera(tracks, person.poses, person.metres_per_px(tracks)) @ rotation
-    scale = by_contacts(joints[:, ANKLES], position, tracks.stamp_ns)
-    if scale is None or scale.std > FEET_TELL or abs(np.log(scale.factor)) < LEAST_SCALE_STD:
-        return path
-    floor = (position[-1] + joints[-1, BODY_17.index("pelvis")]) * [1.0, 1.0, 0.0]
-    world = replace(path.world, upright=upright._replace(scale_std=max(scale.std, LEAST_SCALE_STD)))
-    tracks = replace(tracks, camera_position=floor + scale.factor * (position - floor))
-    return replace(path, tracks=tracks, world=world, rescaled=path.rescaled + 1)
+    floor = (position[-1] + seen[-1, BODY_17.index("pelvis")] @ rotation[-1]) * [1.0, 1.0, 0.0]
+    return replace(
+        path,
+        tracks=replace(
+            tracks, camera_rotation=rotation @ turn.T, camera_position=floor + factor * (position - floor) @ turn.T
+        ),
+        world=replace(path.world, upright=upright),
+        corrections=path.corrections + 1,
+    )
 
 
 def _from(tracks: Tracks, position: np.ndarray, rotation: np.ndarray) -> Tracks:

@@ -50,7 +50,7 @@ class PictureWindows:
         lost, why = self._odometry.losses > had, self._odometry.lost
         if path is None:
             return replace(camera_result, picture=why, lost=lost)
-        of = w.subject, path.number, path.rescaled
+        of = w.subject, path.number, path.corrections
         if self._of != of:
             self._of, self._chain = of, WorldChain()
         placed = self._placed(path, person, w.keypoints[use], camera_result)

@@ -97,21 +97,28 @@ def test_a_path_goes_on_in_windows_that_share_no_image(speed_deg_s: float, strid
         assert np.linalg.norm(place[0] - place[1], axis=1).max() < 0.1
 
 
-def test_a_path_takes_over_the_metres_of_later_windows() -> None:
-    true, small_s = orbit(11.0), 4.5
+@pytest.mark.parametrize(("smaller", "leaning_deg"), [(0.8, 0.0), (1.0, 20.0)])
+def test_a_path_takes_over_the_metres_and_the_up_of_later_windows(smaller: float, leaning_deg: float) -> None:
+    true = orbit(11.0)
+    c, s = smaller * np.cos(np.deg2rad(leaning_deg)), smaller * np.sin(np.deg2rad(leaning_deg))
     seen = list(true.observations)
-    for i, o in enumerate(seen[: round(small_s * FPS)]):
-        middle = np.nanmean(o.keypoints, axis=0)
-        seen[i] = replace(o, keypoints=(middle + 0.8 * (o.keypoints - middle)).astype(np.float32))
+    for i, o in enumerate(seen[: round(4.5 * FPS)]):
+        offset = o.keypoints - np.nanmean(o.keypoints, axis=0)
+        changed = (o.keypoints - offset + offset @ np.array([[c, s], [-s, c]])).astype(np.float32)
+        seen[i] = replace(o, keypoints=changed)
     there = [w for w in windows(replace(true, observations=seen), true.points_at) if w.window.in_map is not None]
-    factors = []
+    factors, tilts_deg = [], []
     for w in there:
-        place = true.position[np.searchsorted(true.stamp_ns, w.window.stamp_ns)]
-        ways = [np.linalg.norm(path - path.mean(axis=0)) for path in (camera_of(w)[1], place)]
+        place = np.searchsorted(true.stamp_ns, w.window.stamp_ns)
+        rotation, position = camera_of(w)
+        ways = [np.linalg.norm(path - path.mean(axis=0)) for path in (position, true.position[place])]
         factors.append(ways[0] / ways[1])
+        tilts_deg.append(np.degrees(np.arccos(np.clip(rotation[-1, :, 2] @ true.rotation[place[-1], :, 2], -1, 1))))
         assert "path 1," in w.window.picture
-    assert factors[0] > 1.15  # a person that seems farther away
+    assert factors[0] > 1.15 or smaller == 1.0  # a person that seems farther away
+    assert tilts_deg[0] > 10.0 or leaning_deg == 0.0
     assert abs(factors[-1] - 1.0) < 0.08
+    assert tilts_deg[-1] < 1.0
     assert abs(there[-1].joints3d[:, :, 2].min()) < 0.2  # the floor stays
 
 
