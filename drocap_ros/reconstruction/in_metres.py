@@ -125,7 +125,7 @@ def in_metres(
         if body.covariance is not None:
             meta["covariance_about"] = "pelvis"
         return body
-    refined = _with_camera_of(source, refined)
+    refined = _with_camera_of(source, refined, settings.adjuster.stature_std)
     meta["calibration"], meta["covariance_about"] = refined.calibration, "origin"
     camera = refined.rotation, refined.position
     return dataclasses.replace(
@@ -156,10 +156,10 @@ def _with_scale_of(source: Source, placed: WorldPoses, meta: dict[str, object]) 
     return placed
 
 
-def _with_camera_of(source: Source, refined: RefinedWorld) -> RefinedWorld:
+def _with_camera_of(source: Source, refined: RefinedWorld, stature_std: float) -> RefinedWorld:
     """The adjusted world with what is known of its camera."""
     if isinstance(source, PictureWorld):
-        return at_assumed_stature(refined)
+        return at_assumed_stature(refined, source, stature_std)
     if isinstance(source, FusedTelemetry):
         return with_fusion(refined, source)
     return refined if source is None else source.holds(refined)

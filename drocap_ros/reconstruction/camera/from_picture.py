@@ -60,6 +60,7 @@ class PictureCamera:
     points : (J, 4) fixed points, x y z w
     residual_px : median of the points' residuals; covered : share of the frames with enough points
     position_std, turn_std_deg : of the path's change from knot to knot (an eighth of a second), in its unit, degrees
+    drift : (F, 2) standard deviations of position (its unit) and turn (rad) after the best similarity; None = unknown
     """
 
     kind: Kind
@@ -72,6 +73,7 @@ class PictureCamera:
     covered: float = 0.0
     position_std: float = float("nan")
     turn_std_deg: float = float("nan")
+    drift: np.ndarray | None = None
 
 
 def camera_from_points(
@@ -194,6 +196,7 @@ def _turning(sightings: Sightings, camera: PictureCamera, fps: float) -> Picture
 def _checked(camera: PictureCamera, found: AdjustedPath) -> PictureCamera:
     """The camera with what its adjustment tells, and whether it fits."""
     focal = float(np.exp(found.shared[FOCAL]))
+    shape = None if found.posterior is None else found.posterior.shape
     steps = None if found.posterior is None else np.sqrt(np.diagonal(found.posterior.steps, axis1=1, axis2=2))
     return replace(
         camera,
@@ -205,7 +208,13 @@ def _checked(camera: PictureCamera, found: AdjustedPath) -> PictureCamera:
         covered=found.covered,
         position_std=float("nan") if steps is None else float(np.median(steps[:, :3])),
         turn_std_deg=float("nan") if steps is None else float(np.degrees(np.median(steps[:, 3:]))),
+        drift=None if shape is None else _at_frames(shape, len(camera.rotation)),
     )
+
+
+def _at_frames(values: np.ndarray, frames: int) -> np.ndarray:
+    """Those (K, ...) of the nearest knots."""
+    return np.asarray(values[np.round(np.linspace(0, len(values) - 1, frames)).astype(np.intp)])
 
 
 def fits(found: AdjustedPath, matrix: np.ndarray) -> bool:

@@ -7,11 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.geometry.rotations import hat
 from drocap_ros.reconstruction.camera.path_equations import PathEquations
 from drocap_ros.reconstruction.camera.path_model import ATTITUDE_LATENCY, KNOT, MISALIGNMENT, POSITION_LATENCY, SHARED
 from drocap_ros.reconstruction.camera.path_residuals import PathResiduals
 from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
 
+#: Knots of which the deviations after the best similarity are computed: each costs six columns of the inverse.
+_NODES = 24
 #: Half of the squared lengths of pairs with a standard deviation of 1 are below it.
 _MEDIAN_SQUARE = 1.39
 
@@ -24,6 +27,7 @@ class Posterior(NamedTuple):
     steps : (K - 1, 6, 6) of the change of the errors from knot to knot
     place : (3, 3) of the mean position of the path: what all its frames have in common, as points never tell it
     pose : (K, 6, 6) of the corrected camera: errors and shared unknowns, about that place and with it
+    shape : (K, 2) standard deviations of position and rotation after the best similarity, of a path without telemetry
     """
 
     shared: np.ndarray
@@ -31,6 +35,7 @@ class Posterior(NamedTuple):
     steps: np.ndarray
     place: np.ndarray
     pose: np.ndarray
+    shape: np.ndarray | None
 
 
 def posterior_of(r: PathResiduals) -> Posterior | None:
@@ -60,7 +65,35 @@ def posterior_of(r: PathResiduals) -> Posterior | None:
     beside = beside + lever[:-1] @ shared @ np.swapaxes(lever[1:], 1, 2)
     steps = knots[1:] + knots[:-1] - beside - np.swapaxes(beside, 1, 2)
     fact = r.data.config.views_per_fact
-    return Posterior(fact * shared, fact * knots, fact * steps, fact * place, fact * pose)
+    # Telemetry, whose misalignment is free, holds a path as a whole.
+    shape = None if r.weights.free[MISALIGNMENT].any() else np.sqrt(fact) * _shape(r, factor, total, shared)
+    return Posterior(fact * shared, fact * knots, fact * steps, fact * place, fact * pose, shape)
+
+
+def _shape(r: PathResiduals, factor: np.ndarray, total: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """(K, 2) standard deviations of position and rotation of the knots after the best similarity, by some of them."""
+    frame = r.data.knots.frame
+    some = np.unique(np.round(np.linspace(0, len(frame) - 1, _NODES)).astype(np.intp))
+    own = np.zeros((len(frame), KNOT, len(some), KNOT))
+    own[some, :, np.arange(len(some))] = np.eye(KNOT)
+    columns = KNOT * len(some)
+    inverse = backward(factor, forward(factor, own.reshape(-1, columns)))
+    covariance = inverse.reshape(len(frame), KNOT, columns)[some].reshape(columns, columns)
+    by_shared = total[some].reshape(columns, -1)
+    covariance = covariance + by_shared @ shared @ by_shared.T
+    # Moving, turning and stretching the whole path, one column each, for every node's position and rotation.
+    place = r.position[frame[some]]
+    about = place - place.mean(axis=0)
+    whole = np.zeros((len(some), KNOT, 7))
+    whole[:, :3, :3], whole[:, :3, 3:6], whole[:, :3, 6] = np.eye(3), -hat(about), about
+    whole[:, 3:, 3:6] = -r.rotation[frame[some]]
+    way = max(float(np.linalg.norm(about, axis=1).max()), 1e-9)
+    weight = np.tile(np.repeat([1.0 / way, 1.0], 3), len(some))
+    free = whole.reshape(columns, 7)
+    left = np.eye(columns) - free @ np.linalg.pinv(weight[:, None] * free) * weight
+    variance = np.diag(left @ covariance @ left.T).reshape(len(some), 2, 3).mean(axis=2)
+    at = np.arange(len(frame))
+    return np.stack([np.interp(at, some, np.sqrt(np.maximum(of, 0.0))) for of in variance.T], axis=1)
 
 
 def with_own_noise(r: PathResiduals) -> PathResiduals:

@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
+from drocap_ros.reconstruction.camera.fusion import with_camera_errors
 from drocap_ros.reconstruction.camera.upright import Upright, set_upright
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
@@ -36,11 +38,13 @@ class PictureWorld:
 
     upright : its path in the world; None = the camera is not known
     config : of the adjustment of body and camera with it; None = up is unsure, and the body stays as it is seen
+    errors : (F, 6, 6) covariance of its position (m) and rotation (rad) about the path's mean; None = unknown
     """
 
     camera: PictureCamera
     upright: Upright | None = None
     config: WorldConfig | None = None
+    errors: np.ndarray | None = None
 
     def meta(self) -> dict[str, object]:
         """JSON-compatible: where the world comes from."""
@@ -80,7 +84,8 @@ def picture_camera(tracks: Tracks) -> PictureCamera | None:
         tracks.image_size,
         tracks.camera_matrix,
     )
-    return replace(camera, rotation=camera.rotation[slot], position=camera.position[slot])
+    drift = None if camera.drift is None else camera.drift[slot]
+    return replace(camera, rotation=camera.rotation[slot], position=camera.position[slot], drift=drift)
 
 
 def with_camera(
@@ -103,7 +108,17 @@ def with_camera(
         checks=False,
         corrected=True,
     )
-    return world, PictureWorld(camera, upright, config if upright.std_deg < _SURE_UP_DEG else None)
+    sure = upright.std_deg < _SURE_UP_DEG
+    return world, PictureWorld(camera, upright, config if sure else None, _errors(camera, upright.position))
+
+
+def _errors(camera: PictureCamera, position: np.ndarray) -> np.ndarray | None:
+    """(F, 6, 6) covariance of a camera's position (m) and rotation (rad), whose path (F, 3) m is known."""
+    if camera.drift is None:
+        return None
+    way_m, way = (float(np.linalg.norm(np.ptp(path, axis=0))) for path in (position, camera.position))
+    std = camera.drift * [way_m / max(way, 1e-9), 1.0]
+    return np.asarray(np.eye(6) * np.square(np.repeat(std, 3, axis=1))[:, None])
 
 
 def seen_from_camera(tracks: Tracks, poses: ImagePoses, per_px: np.ndarray) -> np.ndarray:
@@ -114,15 +129,22 @@ def seen_from_camera(tracks: Tracks, poses: ImagePoses, per_px: np.ndarray) -> n
     return place_in_world(in_camera_axes(poses, per_px), projected, per_px, still).joints
 
 
-def at_assumed_stature(refined: RefinedWorld) -> RefinedWorld:
-    """The world with the body at its assumed stature: nothing else gives a path of the picture its metres."""
+def at_assumed_stature(refined: RefinedWorld, world: PictureWorld, stature_std: float) -> RefinedWorld:
+    """The world with the body at its assumed stature: nothing else gives a path of the picture its metres.
+
+    Its joints are as uncertain, about their mean place, as path and stature (relative deviation) make them, too.
+    """
     scale = float(np.median([window["scale"] for window in refined.calibration]))
+    if world.errors is not None:
+        refined = with_camera_errors(refined, world.errors)
+    arm = refined.joints - np.nanmean(refined.joints, axis=(0, 1))
+    by_stature = pack_covariance(stature_std**2 * arm[..., :, None] * arm[..., None, :])
     return replace(
         refined,
         joints=refined.joints / scale,
         position=refined.position / scale,
         place=refined.place / scale**2,
-        covariance=refined.covariance / scale**2,
+        covariance=(refined.covariance + by_stature) / scale**2,
         metric=False,
     )
 

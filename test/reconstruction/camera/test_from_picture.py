@@ -99,6 +99,22 @@ def test_far_things_do_not_hold_a_hovering_camera_fast(seed: int) -> None:
     assert shape_error(camera_of(scene, noise_px=0.3).position, scene.position) < 0.1
 
 
+def test_deviations_of_a_path_are_as_its_errors_and_tell_a_weak_place() -> None:
+    scene, weak = orbiting(), (18, 26)
+    within = (scene.frame >= weak[0]) & (scene.frame < weak[1])
+    # Most tracks end there: few points carry the path over it.
+    few = ~within | (scene.track // 1000 % 4 == 0)
+    thin = scene._replace(frame=scene.frame[few], track=scene.track[few], point=scene.point[few])
+    thin = thin._replace(track=thin.track + 1_000_000 * ((thin.track // 1000 % 4 > 0) & (thin.frame >= weak[1])))
+    claimed_m = []
+    for camera in [camera_of(each, noise_px=0.4) for each in (scene, thin)]:
+        assert camera.drift is not None
+        way = np.linalg.norm(np.ptp(scene.position, axis=0)) / np.linalg.norm(np.ptp(camera.position, axis=0))
+        claimed_m.append(way * np.sqrt(3.0 * np.square(camera.drift[:, 0]).mean()))
+        assert 0.2 < shape_error(camera.position, scene.position) / claimed_m[-1] < 1.5
+    assert claimed_m[1] > 1.2 * claimed_m[0]
+
+
 @pytest.mark.parametrize("noise_px", [0.3, 0.62])
 def test_camera_that_stands_still_is_named(noise_px: float) -> None:
     rotation, position = orbit(1, FPS)
