@@ -74,11 +74,13 @@ def _shape(r: PathResiduals, factor: np.ndarray, total: np.ndarray, shared: np.n
     """(K, 2) standard deviations of position and rotation of the knots after the best similarity, by some of them."""
     frame = r.data.knots.frame
     some = np.unique(np.round(np.linspace(0, len(frame) - 1, _NODES)).astype(np.intp))
-    own = np.zeros((len(frame), KNOT, len(some), KNOT))
-    own[some, :, np.arange(len(some))] = np.eye(KNOT)
     columns = KNOT * len(some)
-    inverse = backward(factor, forward(factor, own.reshape(-1, columns)))
-    covariance = inverse.reshape(len(frame), KNOT, columns)[some].reshape(columns, columns)
+    covariance = np.empty((columns, columns))
+    for column, node in enumerate(some.tolist()):  # one by one: an hour has a wide inverse
+        own = np.zeros((len(frame), KNOT, KNOT))
+        own[node] = np.eye(KNOT)
+        inverse = backward(factor, forward(factor, own.reshape(-1, KNOT))).reshape(own.shape)
+        covariance[:, KNOT * column : KNOT * (column + 1)] = inverse[some].reshape(columns, KNOT)
     by_shared = total[some].reshape(columns, -1)
     covariance = covariance + by_shared @ shared @ by_shared.T
     # Moving, turning and stretching the whole path, one column each, for every node's position and rotation.
