@@ -283,27 +283,26 @@ def _corrected(path: PicturePath, grown: tuple[np.ndarray, np.ndarray, np.ndarra
     seen = seen_from_camera(tracks, person.poses, person.metres_per_px(tracks))
     scale = by_contacts((seen @ rotation)[:, ANKLES], position, tracks.stamp_ns)
     fresh = set_upright(*grown, seen, tracks.stamp_ns)
-    factor, turn = 1.0, np.eye(3)
+    factor, turn, lift = 1.0, np.eye(3), 0.0
     if scale is not None and scale.std < FEET_TELL and LEAST_SCALE_STD < abs(np.log(scale.factor)) < _MOST_SCALE:
         factor = scale.factor
         upright = upright._replace(scale_std=max(scale.std, LEAST_SCALE_STD))
+    pelvis = seen[-1, BODY_17.index("pelvis")]
+    floor = (position[-1] + pelvis @ rotation[-1]) * [1.0, 1.0, 0.0]
     up = rotation[-1].T @ fresh.rotation[-1, :, 2]
     tilt = np.arccos(np.clip(up[2], -1.0, 1.0))
     if fresh.source is UpSource.GROUND and tilt > np.deg2rad(_TILTED_DEG):
         across = np.cross(up, [0.0, 0.0, 1.0])
         turn = exp_so3(tilt * across / np.linalg.norm(across))
+        # The floor is where the ground is.
+        lift = fresh.position[-1, 2] - factor * (turn @ (position[-1] - floor))[2]
         upright = upright._replace(source=fresh.source, std_deg=fresh.std_deg)
     if upright is path.world.upright:
         return path
-    floor = (position[-1] + seen[-1, BODY_17.index("pelvis")] @ rotation[-1]) * [1.0, 1.0, 0.0]
-    return replace(
-        path,
-        tracks=replace(
-            tracks, camera_rotation=rotation @ turn.T, camera_position=floor + factor * (position - floor) @ turn.T
-        ),
-        world=replace(path.world, upright=upright),
-        corrections=path.corrections + 1,
-    )
+    place = floor + factor * (position - floor) @ turn.T + [0.0, 0.0, lift]
+    tracks = replace(tracks, camera_rotation=rotation @ turn.T, camera_position=place)
+    world = replace(path.world, upright=upright)
+    return replace(path, tracks=tracks, world=world, corrections=path.corrections + 1)
 
 
 def _from(tracks: Tracks, position: np.ndarray, rotation: np.ndarray) -> Tracks:
