@@ -47,7 +47,7 @@ from drocap_ros.evaluation.protocol import (
 from drocap_ros.evaluation.rotation import rotation_study
 from drocap_ros.evaluation.tables import rotation_markdown, world_markdown
 from drocap_ros.evaluation.world import world_study
-from drocap_ros.evaluation.world_protocol import WorldCase, world_sequences
+from drocap_ros.evaluation.world_protocol import NONE, WorldCase, world_sequences
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
@@ -90,7 +90,7 @@ def live(args: argparse.Namespace) -> None:
 def live_world(args: argparse.Namespace) -> None:
     pages = []
     cases = [WorldCase(telemetry, background=points) for telemetry in ("exact", "gps") for points in (False, True)]
-    for case in cases:
+    for case in [*cases, WorldCase(NONE, background=True)]:
         with progress_bars() as progress:
             rows = live_world_study(
                 args.mocap, case, every=3, delay_s=SOLUTION_DELAY_S, limit=args.limit, progress=progress

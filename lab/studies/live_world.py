@@ -13,7 +13,7 @@ from drocap_ros.background import Background
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.protocol import FPS, reported
 from drocap_ros.evaluation.tables import WORLD_HEAD, markdown_table, world_cells
-from drocap_ros.evaluation.world_protocol import LONGEST_S, WorldCase, WorldView, world_sequences, world_view
+from drocap_ros.evaluation.world_protocol import LONGEST_S, NONE, WorldCase, WorldView, world_sequences, world_view
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
@@ -28,13 +28,15 @@ from lab.studies.live_study import REFINED_AFTER_S, observations
 class LiveWorldRow(NamedTuple):
     """One sequence: errors of ``pose3d/latest`` and ``refined`` in ``map``, and offline over the latter's frames.
 
-    first_s : time until the first pose in ``map``; share : of all later images with such a pose
+    Without telemetry ``refined`` is in ``odom``, and ``latest`` in the camera's frame: None.
+
+    first_s : time until the first pose in the world; share : of all later images with such a pose
     """
 
     sequence: str
     first_s: float
     share: float
-    latest: WorldErrors
+    latest: WorldErrors | None
     refined: WorldErrors
     offline: WorldErrors
 
@@ -67,17 +69,19 @@ def live_world_study(
 
 def _row(name: str, view: WorldView, delay_s: float) -> LiveWorldRow | None:
     latest, refined = _live(view, delay_s)
-    if len(latest) < 10 or len(refined) < 10:
+    odom = view.tracks.camera_rotation is None
+    if len(latest) < 10 * (not odom) or len(refined) < 10:
         return None
     stamps = view.tracks.stamp_ns
     motion = reconstruct(view.tracks)
     offline = {i: motion.joints3d[i] for i in refined}
-    first = min(latest)
+    first = min(latest or refined)
     return LiveWorldRow(
         name,
-        float((stamps[first] - stamps[0]) * 1e-9),
-        len(latest) / (len(stamps) - first),
-        *(_errors(poses, view.truth) for poses in (latest, refined, offline)),
+        float((stamps[first] - stamps[0]) * 1e-9) + REFINED_AFTER_S * odom,
+        len(latest or refined) / (len(stamps) - first),
+        _errors(latest, view.truth) if latest else None,
+        *(_errors(poses, view.truth) for poses in (refined, offline)),
     )
 
 
@@ -119,14 +123,13 @@ def _live(view: WorldView, delay_s: float) -> tuple[dict[int, np.ndarray], dict[
 
 def _history(view: WorldView) -> CameraHistory:
     tracks = view.tracks
-    assert tracks.camera_rotation is not None
-    assert tracks.camera_position is not None
     assert tracks.camera_matrix is not None
     history = CameraHistory(2.0 * LONGEST_S)
     history.add_matrix(int(tracks.stamp_ns[0]), tracks.camera_matrix)
-    turns = quaternion_from_matrix(np.swapaxes(tracks.camera_rotation, 1, 2))
-    for stamp, position, turn in zip(tracks.stamp_ns.tolist(), tracks.camera_position, turns, strict=True):
-        history.add_pose(stamp, position, turn)
+    if tracks.camera_rotation is not None and tracks.camera_position is not None:
+        turns = quaternion_from_matrix(np.swapaxes(tracks.camera_rotation, 1, 2))
+        for stamp, position, turn in zip(tracks.stamp_ns.tolist(), tracks.camera_position, turns, strict=True):
+            history.add_pose(stamp, position, turn)
     return history
 
 
@@ -143,11 +146,13 @@ def _errors(poses: dict[int, np.ndarray], truth: np.ndarray) -> WorldErrors:
 
 def live_world_markdown(rows: list[LiveWorldRow], case: WorldCase) -> str:
     """Errors of every sequence as Markdown: latest, refined, offline."""
-    head = f"Live in `map`, {len(rows)} sequences, {case.words()}."
+    frame = "odom" if case.telemetry == NONE else "map"
+    head = f"Live in `{frame}`, {len(rows)} sequences, {case.words()}."
     cells = [
         [f"{row.sequence}, {kind}", *world_cells(errors)]
         for row in rows
         for kind, errors in (("latest", row.latest), ("refined", row.refined), ("offline", row.offline))
+        if errors is not None
     ]
     first = float(np.median([row.first_s for row in rows])) if rows else float("nan")
     share = 100 * float(np.mean([row.share for row in rows])) if rows else float("nan")
@@ -157,7 +162,7 @@ def live_world_markdown(rows: list[LiveWorldRow], case: WorldCase) -> str:
             "",
             *markdown_table(["sequence", *WORLD_HEAD], cells),
             "",
-            f"First pose in `map` after {first:.1f} s in the median; {share:.0f} % of the later images have one.",
+            f"First pose in `{frame}` after {first:.1f} s in the median; {share:.0f} % of the later images have one.",
             "",
         ]
     )

@@ -7,7 +7,7 @@ import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.protocol import orbit_view
-from drocap_ros.evaluation.world_protocol import WorldCase
+from drocap_ros.evaluation.world_protocol import NONE, WorldCase
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15, BODY_17
@@ -91,3 +91,8 @@ def test_live_poses_in_map_are_measured_beside_the_offline_ones(tmp_path):
     text = live_world_markdown([row], WorldCase("exact"))
     assert "walk, latest" in text
     assert f"after {row.first_s:.1f} s" in text
+    # By the picture alone.
+    (row,) = live_world_study(tmp_path, WorldCase(NONE, background=True))
+    assert row.latest is None
+    assert row.refined.w_mm < 2.0 * row.offline.w_mm + 60.0
+    assert "Live in `odom`" in live_world_markdown([row], WorldCase(NONE, background=True))
