@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+LENGTH_ERROR = 0.1  # of a quaternion's length, from which it is none: far above rounding in a message
+
 
 def hat(v: np.ndarray) -> np.ndarray:
     """Cross-product matrix (..., 3, 3) of vectors (..., 3): ``hat(v) @ u == cross(v, u)``."""
@@ -118,7 +120,7 @@ def _length(x: float, y: float, z: float, w: float) -> float:
 def unit_quaternions(q: np.ndarray) -> np.ndarray:
     """Normalized quaternions (N, 4); NaN where the length differs from 1 by more than a tenth."""
     length = np.linalg.norm(q, axis=1, keepdims=True)
-    return np.where(np.abs(length - 1.0) < 0.1, q / np.where(length > 0, length, 1.0), np.nan)
+    return np.where(np.abs(length - 1.0) < LENGTH_ERROR, q / np.where(length > 0, length, 1.0), np.nan)
 
 
 def slerp(q0: np.ndarray, q1: np.ndarray, s: np.ndarray | float) -> np.ndarray:

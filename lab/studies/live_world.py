@@ -69,17 +69,17 @@ def live_world_study(
 
 def _row(name: str, view: WorldView, delay_s: float) -> LiveWorldRow | None:
     latest, refined = _live(view, delay_s)
-    odom = view.tracks.camera_rotation is None
-    if len(latest) < 10 * (not odom) or len(refined) < 10:
+    in_world = latest or refined
+    if min(len(in_world), len(refined)) < 10:
         return None
     stamps = view.tracks.stamp_ns
     motion = reconstruct(view.tracks)
     offline = {i: motion.joints3d[i] for i in refined}
-    first = min(latest or refined)
+    first = min(in_world)
     return LiveWorldRow(
         name,
-        float((stamps[first] - stamps[0]) * 1e-9) + REFINED_AFTER_S * odom,
-        len(latest or refined) / (len(stamps) - first),
+        float((stamps[first] - stamps[0]) * 1e-9) + (0.0 if latest else REFINED_AFTER_S),
+        len(in_world) / (len(stamps) - first),
         _errors(latest, view.truth) if latest else None,
         *(_errors(poses, view.truth) for poses in (refined, offline)),
     )

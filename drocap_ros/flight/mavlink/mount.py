@@ -15,7 +15,7 @@ from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler, yaw_of
 from drocap_ros.flight.mavlink.message import Message
-from drocap_ros.geometry.rotations import quaternion_multiply, slerp
+from drocap_ros.geometry.rotations import LENGTH_ERROR, normalized, quaternion_multiply, slerp
 from drocap_ros.stamps import NS
 
 _EARTH, _NOSE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
@@ -152,5 +152,5 @@ MESSAGES = frozenset(_READERS)
 
 def finite_quaternion(x: float, y: float, z: float, w: float) -> np.ndarray | None:
     """Normalized (4,) x y z w; None where a value is not finite or the length is too far from 1."""
-    length = math.sqrt(x * x + y * y + z * z + w * w)
-    return np.array([x / length, y / length, z / length, w / length]) if abs(length - 1.0) < 0.1 else None
+    off = abs(math.sqrt(x * x + y * y + z * z + w * w) - 1.0)  # NaN is below nothing
+    return np.array(normalized(x, y, z, w)) if off < LENGTH_ERROR else None

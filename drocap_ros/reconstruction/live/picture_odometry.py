@@ -78,7 +78,8 @@ class PicturePath:
 
     tracks : with the camera; world : how it was found, with up, metres and their deviations; number : of the path
     begun_ns : stamp of the path's first image; drift_m, drift_rad : deviation of place and turn within a second
-    subject : whose assumed stature gives its metres; corrections : how often a later window has told them, and up, anew
+    subject : whose assumed stature gives its metres
+    corrections : number of later windows that corrected its up or its metres
     """
 
     tracks: Tracks

@@ -29,7 +29,7 @@ class PictureWindows:
         self._config = world_config(config)
         self._length_ns = round(config.world_window_s * 1e9)
         self._odometry, self._chain = PictureOdometry(), WorldChain()
-        self._of: tuple[int, int, int] | None = None  # subject, path and metres of the chain
+        self._of: tuple[int, int, int] | None = None  # subject, path and corrections of the chain
 
     def adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
         """The window's result in ``odom``, or that in the camera's axes with the reason.
@@ -60,12 +60,8 @@ class PictureWindows:
         self, path: PicturePath, person: Person, keypoints: Keypoints2D, seen: AdjustedWindow
     ) -> AdjustedWindow:
         """The window's last images, those of the path, in ``odom``; ``seen`` : all of it in camera axes."""
-        poses, tracks, config, use = (
-            person.poses,
-            path.tracks,
-            path.world.config,
-            slice(len(seen.stamp_ns) - len(keypoints), None),
-        )
+        poses, tracks, config = person.poses, path.tracks, path.world.config
+        use = slice(len(seen.stamp_ns) - len(keypoints), None)
         rotation, position = tracks.camera_rotation, tracks.camera_position
         assert rotation is not None
         assert position is not None
