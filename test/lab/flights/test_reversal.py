@@ -7,8 +7,9 @@ from drocap_ros.flight.orbit.states import State
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 
-@pytest.mark.parametrize("changes", [{"reverse_every_s": 10.0}, {"calibrate_telemetry": True}])
-@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+@pytest.mark.parametrize(
+    ("autopilot", "changes"), [("ardupilot", {"reverse_every_s": 10.0}), ("px4", {"calibrate_telemetry": True})]
+)
 def test_orbit_turns_without_a_hold(autopilot, changes):
     settings = LoopSettings(autopilot=autopilot, seed=2, distance_m=6.5, seconds=36.0)
     loop = OrbitLoop(with_config(settings, body_height_m=1.75, size_error=0.04, **changes))
