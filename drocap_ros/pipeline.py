@@ -53,6 +53,7 @@ class Selection:
     evidence : file of 3D poses of its images by another system
     people : numbers of those whom :mod:`drocap_ros.people` reconstructs; empty = everybody
     threads : that share the work on the images; the result is the same with any number
+    on_image : called with each image of a video and its pose, in the order of time
     on_tracks : called with the tracks and their origin, as in ``meta`` of the motion, before that is computed
     """
 
@@ -64,7 +65,8 @@ class Selection:
     evidence: Path | None = None
     people: tuple[int, ...] = ()
     threads: int = field(default=2, compare=False)
-    on_tracks: Callable[[Tracks, Values], None] | None = field(default=None, compare=False)
+    on_image: Callable[[Frame, PoseObservation], None] = field(default=lambda *_: None, compare=False)
+    on_tracks: Callable[[Tracks, Values], None] = field(default=lambda *_: None, compare=False)
 
 
 #: A person counts after a confirmation, s; whoever is first seen before a clip's end is counted by then.
@@ -116,8 +118,7 @@ def reconstruct_input(
     if selection.rate_hz:
         tracks = tracks.at_rate(selection.rate_hz)
     seconds = time.perf_counter() - begin
-    if selection.on_tracks is not None:
-        selection.on_tracks(tracks, origin)
+    selection.on_tracks(tracks, origin)
     from drocap_ros.reconstruction.reconstruct import reconstruct
 
     motion = reconstruct(
@@ -278,15 +279,15 @@ def _track(
     config = config.replace("pose_estimator", on_loss="next")
     folder, clip = models_folder(models or config.pose_estimator.models_dir), selection.clip
     settings, begin_ns = follow_selected(path, config, folder, selection, progress)
-    together, topic = 0, selection.topic
+    crowded, topic = list[bool](), selection.topic
     with open_images(path, config.image_ingest, topic) as images:
         estimator = PoseEstimator(folder, settings)
         meter = clip.meter(progress, "2D pose", images.duration_s)
 
         def on_frame(frame: Frame, observation: PoseObservation) -> None:
-            nonlocal together
             meter(frame, observation)
-            together += in_view(estimator.tracker.persons, frame.stamp_ns) > 1
+            selection.on_image(frame, observation)
+            crowded.append(in_view(estimator.tracker.persons, frame.stamp_ns) > 1)
 
         observations = observe(clip.select(images.frames), estimator, on_frame, begin_ns, selection.threads)
     try:
@@ -294,13 +295,12 @@ def _track(
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     words = [f"{(t - tracks.stamp_ns[0]) * 1e-9:.1f} s: {text}" for t, text in estimator.tracker.changes][1:]
-    origin: Values = {"pose2d": "estimated", "subject": words}
+    seen = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
+    origin: Values = {"pose2d": "estimated", "subject": words, "images": seen | ({"topic": topic} if topic else {})}
     logger.log(logging.WARNING if words else logging.DEBUG, "%s: %s", path, "; ".join(words))
-    origin["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
-    origin["images"] |= {"topic": topic} if topic else {}
     if selection.person is not None:
         return tracks, {**origin, "person": selection.person}
-    if (in_turn := len(subjects(observations)) > 1) or together > 1:  # the whole image is searched once a second
+    if (in_turn := len(subjects(observations)) > 1) or sum(crowded) > 1:  # the whole image is searched once a second
         chosen = "the one in most images" if in_turn else "one of them"
         text = "%s: several persons, %s is reconstructed; `drocap track %s --list` numbers them for --subject N"
         logger.warning(text, path, chosen, path)

@@ -181,7 +181,10 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
                 print(text)
             return 0
         shown = source == args.input and "report.html" in names and has_images(source)
-        with ImagesBeside(source if shown else None, progress) as images:
+        with ImagesBeside(source if shown else None, progress, 4 if args.threads > 1 else 0) as images:
+            selection = dataclasses.replace(selection, on_image=images.keep)
+            if args.threads > 1:
+                selection = dataclasses.replace(selection, on_tracks=images.begin)
             motion, tracks = reconstruct_input(
                 source,
                 method=args.method,
@@ -189,7 +192,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
                 models=args.models,
                 progress=progress,
                 telemetry=telemetry,
-                selection=dataclasses.replace(selection, on_tracks=images.begin if args.threads > 1 else None),
+                selection=selection,
             )
             meta = {**motion.meta, "input": args.input.name, "command": args.command_line}
             motion = dataclasses.replace(motion, meta=meta)

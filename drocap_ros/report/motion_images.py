@@ -17,26 +17,28 @@ from drocap_ros.clip import Progress
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.motion import Motion
+from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import Images, open_images
 from drocap_ros.perception.models.network_input import shrink
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.sources.base import prefetch
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
+from drocap_ros.report.crop import Box, FollowingBox
 from drocap_ros.tracks import Tracks
 
 #: Most images in a report, and bytes of all together, as base64: the page stays quick to open and to mail.
 MAX_IMAGES = 300
 MAX_BYTES = 8_000_000  # bytes; mail often ends at 10 MB
-#: Longer side of an image in the page, px.
-_LONG_SIDE = 640
+#: Longer side of an image in the page, px: the subject takes most of it.
+_LONG_SIDE = 480
 #: How an image is compressed, the best first: at a share of that size and a quality.
 _STEPS = tuple((share, quality) for share in (1, 2, 4) for quality in (75, 60, 45, 30))
 #: Growth of the bytes by a step up, of three videos at least 1.13, until a video has shown its own: a step that cannot
 #: fit is not tried.
 _GROWTH = 1.12
-#: Margin of the crop, as a share of its size.
-_MARGIN = 0.12
+#: Most images that are kept while their poses are found, 60 MB: the report of a longer recording reads it again.
+_MOST_KEPT = 3000
 #: Tolerances of the checks whether images belong to a motion: their number (re-encoding loses a few), their rate, and
 #: the share of keypoints outside of them.
 _LENGTH_SHARE = 0.02
@@ -50,12 +52,12 @@ class MotionImages:
 
     frames : index of each image's frame in the motion, increasing
     jpegs : as many JPEG files
-    box : x_min, y_min, x_max, y_max px of the crop
+    boxes : as many crops, of which they are
     """
 
     frames: tuple[int, ...]
     jpegs: tuple[bytes, ...]
-    box: tuple[int, int, int, int]
+    boxes: tuple[Box, ...]
 
 
 class ShownTracks(NamedTuple):
@@ -70,28 +72,53 @@ Shown: TypeAlias = Motion | ShownTracks
 
 
 class ImagesBeside(AbstractContextManager["ImagesBeside"]):
-    """Reads the images of a motion in another thread while the motion is computed.
+    """The images of a motion, kept while its poses are found, else read in another thread while it is computed.
 
     path : source of the motion; None = it has no images
+    waiting : most images that wait for the thread that compresses them; 0 = it has none of its own
     """
 
-    def __init__(self, path: Path | None, progress: Progress) -> None:
-        self._path, self._progress = path, progress
+    def __init__(self, path: Path | None, progress: Progress, waiting: int = 4) -> None:
+        self._path, self._progress, self._waiting = path, progress, waiting
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="images")
         self._stop = threading.Event()
         self._read: Future[MotionImages] | None = None
+        self._encode, self._follow = _Encoder(), FollowingBox()
+        self._keeps, self._kept = path is not None, list[Future[tuple[bytes, Box]]]()
+
+    def keep(self, frame: Frame, observation: PoseObservation) -> None:
+        """Keep an image, in the order of time, as its pose was found: the motion's row of its number."""
+        if len(self._kept) == _MOST_KEPT:
+            self._keeps, self._kept = False, []
+        if not self._keeps:
+            return
+        box = self._follow(frame.stamp_ns, observation.keypoints, frame.image.shape)
+        self._kept.append(self._pool.submit(self._compressed, frame.image, box))
+        if len(self._kept) > self._waiting:
+            self._kept[-1 - self._waiting].result()
+
+    def _compressed(self, image: np.ndarray, box: Box) -> tuple[bytes, Box]:
+        return self._encode(image, box), box
 
     def begin(self, tracks: Tracks | Motion, meta: Mapping[str, object]) -> None:
         """Begin to read, as soon as the motion's tracks and what its ``meta`` says of the images are known."""
-        if self._path is not None:
+        if self._path is not None and self._kept_of(tracks) is None:
             shown = ShownTracks(tracks.stamp_ns, tracks.keypoints, meta)
             self._read = self._pool.submit(read_motion_images, self._path, shown, self._unless_stopped)
 
     def of(self, motion: Motion) -> MotionImages | None:
-        """The images of the motion; they are read now where nobody has begun."""
+        """The images of the motion; they are read now where they were not kept, and nobody has begun."""
         if self._read is None:
             self.begin(motion, motion.meta)
-        return None if self._read is None else self._read.result()
+        return self._kept_of(motion) if self._read is None else self._read.result()
+
+    def _kept_of(self, tracks: Tracks | Motion) -> MotionImages | None:
+        """The kept images; None where they are not one for each row, as of a recording that holds its poses."""
+        if len(self._kept) != len(tracks.stamp_ns):
+            return None
+        rows = _wanted(len(self._kept))
+        jpegs, boxes = zip(*(self._kept[row].result() for row in rows), strict=True)
+        return MotionImages(tuple(rows), jpegs, boxes)
 
     def _unless_stopped(self, stage: str, done: float) -> None:
         if self._stop.is_set():
@@ -124,21 +151,24 @@ def read_motion_images(path: Path, motion: Shown, progress: Progress | None = No
     InputError
         When there are no images, or none at the motion's times.
     """
-    count = min(MAX_IMAGES, len(motion.stamp_ns))
-    wanted = np.unique(np.linspace(0, len(motion.stamp_ns) - 1, count).round().astype(int))
-    encode = None
-    frames: list[int] = []
-    jpegs: list[bytes] = []
+    encode, follow = _Encoder(), FollowingBox()
+    found: list[tuple[int, bytes, Box]] = []
     with _opened(path, motion) as source:
-        for index, image in _matched(source, motion, wanted):
-            encode = encode or _Encoder(motion, image.shape, len(wanted))
-            frames.append(index)
-            jpegs.append(encode(image))
+        for index, image in _matched(source, motion, _wanted(len(motion.stamp_ns))):
+            for row in range(found[-1][0] + 1 if found else 0, index + 1):
+                box = follow(int(motion.stamp_ns[row]), motion.keypoints[row], image.shape)
+            found.append((index, encode(image, box), box))
             if progress is not None:
                 progress("report", (index + 1) / len(motion.stamp_ns))
-    if encode is None:
+    if not found:
         raise _no_images(path)
-    return MotionImages(tuple(frames), tuple(jpegs), encode.box)
+    return MotionImages(*zip(*found, strict=True))
+
+
+def _wanted(length: int) -> list[int]:
+    """The frames of a motion that have an image in the report."""
+    wanted: list[int] = np.unique(np.linspace(0, length - 1, min(MAX_IMAGES, length)).round().astype(int)).tolist()
+    return wanted
 
 
 def each_image(path: Path, motion: Shown) -> Iterator[tuple[int, np.ndarray]]:
@@ -151,7 +181,7 @@ def each_image(path: Path, motion: Shown) -> Iterator[tuple[int, np.ndarray]]:
     """
     found = False
     with _opened(path, motion) as source:
-        for index, image in _matched(source, motion, np.arange(len(motion.stamp_ns))):
+        for index, image in _matched(source, motion, range(len(motion.stamp_ns))):
             found = True
             yield index, image
     if not found:
@@ -230,11 +260,11 @@ def _other(path: Path, expected: str, found: str) -> InputError:
     return InputError(f"{path}: expected the images of this motion with {expected}, found {found}; name its own video")
 
 
-def _matched(images: Images, motion: Shown, wanted: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+def _matched(images: Images, motion: Shown, wanted: Iterable[int]) -> Iterator[tuple[int, np.ndarray]]:
     """Images of the wanted frames: the nearest to each stamp within half a frame."""
     stamp_ns = motion.stamp_ns
     half = int(np.median(np.diff(stamp_ns)) / 2) if len(stamp_ns) > 1 else 50_000_000
-    waiting = [int(index) for index in wanted]
+    waiting = list(wanted)
     offset: int | None = None
     before: tuple[int, np.ndarray] | None = None
 
@@ -283,51 +313,32 @@ def _slack_ns(length_ns: int) -> int:
 class _Encoder:
     """Crops, shrinks and compresses each image into its share of the bytes."""
 
-    def __init__(self, motion: Shown, shape: tuple[int, ...], count: int) -> None:
-        height, width = shape[:2]
-        self.box = subject_box(motion.keypoints, width, height)
-        x0, y0, x1, y1 = self.box
-        scale = min(1.0, _LONG_SIDE / max(x1 - x0, y1 - y0))
-        self._size = (max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale)))
-        self._most = int(MAX_BYTES * 0.75 / count)
+    def __init__(self) -> None:
+        self._most = int(MAX_BYTES * 0.75 / MAX_IMAGES)
         self._step = 0  # of the last image: the next one takes hardly more or fewer bytes
         self._growth = [_GROWTH] * len(_STEPS)  # of the bytes from each step to the better one, in the last try
 
-    def __call__(self, image: np.ndarray) -> bytes:
-        """JPEG of an image (H, W, 3) uint8 BGR: of the best step that fits."""
-        x0, y0, x1, y1 = self.box
-        small = shrink(image[y0:y1, x0:x1], self._size)
-        data = self._compressed(small, self._step)
+    def __call__(self, image: np.ndarray, box: Box) -> bytes:
+        """JPEG of a part of an image (H, W, 3) uint8 BGR: of the best step that fits."""
+        x0, y0, x1, y1 = box
+        part = image[y0:y1, x0:x1]
+        data = _compressed(part, self._step)
         while len(data) * self._growth[self._step] <= self._most and self._step:
-            better = self._compressed(small, self._step - 1)
+            better = _compressed(part, self._step - 1)
             self._growth[self._step] = len(better) / len(data)
             if len(better) > self._most:
                 break
             data, self._step = better, self._step - 1
         while len(data) > self._most and self._step < len(_STEPS) - 1:
             self._step += 1
-            data = self._compressed(small, self._step)
+            data = _compressed(part, self._step)
         return data
 
-    def _compressed(self, image: np.ndarray, step: int) -> bytes:
-        import cv2
 
-        share, quality = _STEPS[step]
-        reduced = (
-            image if share == 1 else shrink(image, (max(1, self._size[0] // share), max(1, self._size[1] // share)))
-        )
-        return cv2.imencode(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+def _compressed(image: np.ndarray, step: int) -> bytes:
+    import cv2
 
-
-def subject_box(keypoints: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:
-    """Box x_min, y_min, x_max, y_max px of the subject in all frames, with a margin; the whole image if unknown."""
-    known = keypoints[np.isfinite(keypoints).all(axis=2)]
-    if len(known) < 4:
-        return 0, 0, width, height
-    low, high = np.quantile(known, 0.005, axis=0), np.quantile(known, 0.995, axis=0)
-    room = _MARGIN * max(float((high - low).max()), 32.0)
-    x0, y0 = np.maximum(np.floor(low - room), 0).astype(int).tolist()
-    x1, y1 = np.minimum(np.ceil(high + room), (width, height)).astype(int).tolist()
-    if x1 - x0 < 8 or y1 - y0 < 8:
-        return 0, 0, width, height
-    return x0, y0, x1, y1
+    share, quality = _STEPS[step]
+    scale = min(1.0, _LONG_SIDE / max(image.shape)) / share
+    small = shrink(image, (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))))
+    return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

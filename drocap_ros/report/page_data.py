@@ -96,7 +96,7 @@ def _images(images: MotionImages, shown: np.ndarray) -> dict[str, object]:
     """Images with the index of their frame among those shown, each index once."""
     places, first = np.unique(np.searchsorted(shown, images.frames).clip(0, len(shown) - 1), return_index=True)
     return {
-        "box": list(images.box),
+        "boxes": [list(images.boxes[i]) for i in first],
         "places": places.tolist(),
         "jpeg": [base64.b64encode(images.jpegs[i]).decode() for i in first],
     }
@@ -114,8 +114,8 @@ def images_of_page(page: Path, motion: Motion) -> MotionImages | None:
             return None
         image = data["image"]
         jpegs = tuple(base64.b64decode(text) for text in image["jpeg"])
-        x0, y0, x1, y1 = (int(value) for value in image["box"])
-        return MotionImages(tuple(shown[image["places"]].tolist()), jpegs, (x0, y0, x1, y1))
+        boxes = tuple((int(x0), int(y0), int(x1), int(y1)) for x0, y0, x1, y1 in image["boxes"])
+        return MotionImages(tuple(shown[image["places"]].tolist()), jpegs, boxes)
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError):  # not a report, or one of old
         return None
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from drocap_ros.clip import Progress
 from drocap_ros.motion import Motion, upright_joints
-from drocap_ros.report.motion_images import each_image, subject_box
+from drocap_ros.report.crop import Box, FollowingBox
+from drocap_ros.report.motion_images import each_image
 from drocap_ros.report.statistics import Statistics, motion_statistics, smooth
 from drocap_ros.report.video_file import VideoFile
 from drocap_ros.skeleton import side_of
 
-#: Height of both panes, and width of the one in 3D, px; the other has the shape of the subject's box, within limits.
+#: Sides of both panes, px.
 _HEIGHT = 720
-_LEAST_WIDTH, _MOST_WIDTH = 404, 1280  # px: a phone's portrait; 16:9
 #: The 3D pane is drawn in this size and shrunk: smooth edges.
 _FINE = 2
 #: Most images/s of the video, and s of a picture that stands where the motion has a gap.
@@ -62,39 +62,39 @@ def save_side_by_side(path: Path, motion: Motion, video: Path, progress: Progres
 def _pictures(motion: Motion, video: Path, progress: Progress) -> Iterator[tuple[np.ndarray, float]]:
     """Pictures (720, W, 3) uint8 BGR at an even rate, each with that rate in images/s."""
     s = motion_statistics(motion)
-    body = BodyPicture(motion, s)
+    body, follow = BodyPicture(motion, s), FollowingBox()
     rate_hz = min(s.rate_hz or 1.0, _MOST_HZ)
     longest = int(_LONGEST_STILL_S * rate_hz)
     count = 0
     picture: np.ndarray | None = None
     for index, image in each_image(video, motion):
+        box = follow(int(motion.stamp_ns[index]), motion.keypoints[index], image.shape)
         due = int(s.times_s[index] * rate_hz + 0.5) + 1
         if due <= count:
             continue
         if picture is not None:
             yield from [(picture, rate_hz)] * min(due - count - 1, longest)
-        picture = np.hstack([_as_filmed(image, motion, index), body.draw(index)])
+        picture = np.hstack([_as_filmed(image, box, motion, index), body.draw(index)])
         yield picture, rate_hz
         count = due
         progress("video", (index + 1) / len(s.times_s))
 
 
-def _as_filmed(image: np.ndarray, motion: Motion, index: int) -> np.ndarray:
-    """The subject's part of an image, (720, W, 3), with the keypoints that were found."""
+def _as_filmed(image: np.ndarray, box: Box, motion: Motion, index: int) -> np.ndarray:
+    """The subject's part of an image, (720, 720, 3), with the keypoints that were found."""
     import cv2
 
-    x0, y0, x1, y1 = subject_box(motion.keypoints, image.shape[1], image.shape[0])
-    width = int(np.clip(_HEIGHT * (x1 - x0) / (y1 - y0), _LEAST_WIDTH, _MOST_WIDTH)) // 2 * 2
-    scale = min(width / (x1 - x0), _HEIGHT / (y1 - y0))
+    x0, y0, x1, y1 = box
+    scale = _HEIGHT / max(x1 - x0, y1 - y0)
     # The box in the middle of the pane.
     to_pane = np.array(
-        [[scale, 0.0, 0.5 * (width - scale * (x0 + x1))], [0.0, scale, 0.5 * (_HEIGHT - scale * (y0 + y1))]]
+        [[scale, 0.0, 0.5 * (_HEIGHT - scale * (x0 + x1))], [0.0, scale, 0.5 * (_HEIGHT - scale * (y0 + y1))]]
     )
     way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
     part = cv2.resize(image[y0:y1, x0:x1], None, fx=scale, fy=scale, interpolation=way)
-    pane = np.full((_HEIGHT, width, 3), _GROUND, np.uint8)
+    pane = np.full((_HEIGHT, _HEIGHT, 3), _GROUND, np.uint8)
     top, left = (max(0, round(float(v))) for v in to_pane[[1, 0], 2] + scale * np.array([y0, x0]))
-    part = part[: _HEIGHT - top, : width - left]
+    part = part[: _HEIGHT - top, : _HEIGHT - left]
     pane[top : top + part.shape[0], left : left + part.shape[1]] = part
     places = motion.keypoints[index] @ to_pane[:, :2].T + to_pane[:, 2]
     known = np.isfinite(places).all(axis=1)

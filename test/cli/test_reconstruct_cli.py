@@ -13,6 +13,7 @@ from refusals import refused
 from drocap_ros.cli import main
 from drocap_ros.evaluation.metrics import aligned_error
 from drocap_ros.motion import load_motion
+from drocap_ros.perception.sources.video import VideoSource
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import LIMB_JOINTS, indices
 from drocap_ros.tracks import save_tracks
@@ -88,10 +89,14 @@ def test_the_knees_of_outdoor_walk_bend_as_the_legs_shorten_in_the_image(outdoor
     assert np.median(flexion[100:140]) < 25
 
 
-def test_squats_agree_with_another_system(shared, tmp_path):
+def test_squats_agree_with_another_system(shared, tmp_path, monkeypatch):
+    opened: list[VideoSource] = []
+    begin = VideoSource._opened
+    monkeypatch.setattr(VideoSource, "_opened", lambda source: opened.append(source) or begin(source))
     motion = reconstructed(shared / "media" / "pose_squats.mp4", tmp_path, "--models", shared / "models")
     assert np.isfinite(motion.keypoints).all(axis=2).any(axis=1).mean() >= 0.95
-    # The report shows the pictures of the video.
+    # The report shows the pictures of the video, which was decoded once.
+    assert len(opened) == 1
     assert (tmp_path / "out" / "report.html").read_text().count('"/9j/') == 65
     landmarks = json.loads((shared / "media" / "pose_squats_landmarks3d.json").read_text())
     other = np.array(landmarks, float)[: len(motion.joints3d), BLAZEPOSE, :3]

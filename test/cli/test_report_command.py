@@ -11,7 +11,7 @@ from refusals import refused
 
 from drocap_ros.cli import main
 from drocap_ros.motion import load_motion, save_motion
-from drocap_ros.report.motion_images import subject_box
+from drocap_ros.report.crop import FollowingBox
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.tracks import save_tracks
 
@@ -102,7 +102,9 @@ def test_mp4_shows_the_video_with_the_body_beside_the_body_in_3d(person, folder,
     picture = video.read()[1].astype(int)
     # Left: white joints on the grey video, each at its keypoint.
     width = picture.shape[1] - 720
-    x0, y0, x1, y1 = subject_box(person.keypoints, *size_around(person))
+    follow = FollowingBox()
+    for row in range(frame + 1):
+        x0, y0, x1, y1 = follow(int(person.stamp_ns[row]), person.keypoints[row], size_around(person)[::-1])
     scale = min(width / (x1 - x0), 720 / (y1 - y0))
     middle = 0.5 * np.array([x0 + x1, y0 + y1])
     for x, y in np.round((person.keypoints[frame] - middle) * scale + [width / 2, 360]).astype(int):

@@ -8,6 +8,8 @@ import pytest
 from report_motions import first_frames
 
 from drocap_ros.errors import InputError
+from drocap_ros.observation import PoseObservation
+from drocap_ros.open_images import open_images
 from drocap_ros.report import motion_images
 from drocap_ros.report.motion_images import ImagesBeside, has_images, read_motion_images
 from drocap_ros.report.page_data import page_data
@@ -61,6 +63,59 @@ def test_images_begun_with_the_tracks_are_those_of_the_motion(person, folder):
         assert images.of(motion) == read_motion_images(folder, motion)
 
 
+@pytest.fixture
+def walk(person, tmp_path):
+    """Pictures of noise, and a motion whose keypoints wander through them, come nearer and are missing at times."""
+    rng = np.random.default_rng(0)
+    for number in range(40):
+        cv2.imwrite(str(tmp_path / f"{number:04d}.png"), rng.integers(0, 255, (240, 320, 3), np.uint8))
+    motion = seen_at(person, np.round(np.arange(40) / 30.0 * 1e9))
+    grown = (motion.keypoints - [160, 120]) * np.linspace(1, 2, 40)[:, None, None]
+    keypoints = grown + np.stack([np.linspace(60, 260, 40), np.linspace(80, 160, 40)], -1)[:, None]
+    keypoints[[*range(5), *range(20, 30)]] = np.nan
+    keypoints[15, 3:] = np.nan
+    return tmp_path, dataclasses.replace(motion, keypoints=keypoints)
+
+
+def keep_all(images, folder, motion):
+    with open_images(folder) as source:
+        for frame, keypoints in zip(source.frames, motion.keypoints, strict=True):
+            images.keep(frame, PoseObservation(frame.stamp_ns, 1, (320, 240), keypoints=keypoints))
+
+
+@pytest.mark.parametrize("waiting", [0, 4])
+def test_images_kept_with_their_poses_are_those_that_a_second_reading_finds(walk, monkeypatch, waiting):
+    folder, motion = walk
+    monkeypatch.setattr(motion_images, "MAX_IMAGES", 30)
+    expected = read_motion_images(folder, motion)
+    with ImagesBeside(folder, lambda *_: None, waiting) as images:
+        keep_all(images, folder, motion)
+        for number in range(40):
+            (folder / f"{number:04d}.png").unlink()
+        images.begin(motion, motion.meta)
+        assert images.of(motion) == expected
+
+
+@pytest.mark.parametrize("most", [39, 25])
+def test_more_images_than_are_kept_are_read_again(walk, monkeypatch, most):
+    folder, motion = walk
+    monkeypatch.setattr(motion_images, "_MOST_KEPT", most)
+    with ImagesBeside(folder, lambda *_: None) as images:
+        keep_all(images, folder, motion)
+        assert images.of(motion) == read_motion_images(folder, motion)
+
+
+def test_the_crop_follows_the_subject_evenly(walk):
+    folder, motion = walk
+    boxes = np.array(read_motion_images(folder, motion).boxes)
+    assert (boxes[:5] == [0, 0, 320, 240]).all()  # nobody was seen
+    assert (boxes[20:30] == boxes[19]).all()
+    outside = (motion.keypoints <= boxes[:, None, :2]) | (motion.keypoints >= boxes[:, None, 2:])
+    assert not outside[np.isfinite(motion.keypoints)].any()
+    assert np.abs(np.diff(boxes[5:20], axis=0)).max() < 15
+    assert np.median(boxes[35:, 0]) > np.median(boxes[5:10, 0]) + 50
+
+
 def test_a_failure_beside_ends_the_reading_of_images(person, folder):
     motion = seen_at(person, np.round(np.arange(40) / 30.0 * 1e9))
     read, go_on = [], threading.Event()
@@ -102,8 +157,8 @@ def test_keypoints_lie_on_the_rendered_person_when_the_first_poses_were_left_out
     data = page_data(motion, motion_statistics(motion), images)
     drawn = np.array(data["keypoints"]).reshape(-1, 15, 2) / 10.0
     assert len(images.jpegs) == count - left_out
-    x0, y0, x1, y1 = data["image"]["box"]
-    for place, jpeg in zip(data["image"]["places"], images.jpegs, strict=True):
+    picture = data["image"]
+    for place, jpeg, (x0, y0, x1, y1) in zip(picture["places"], images.jpegs, picture["boxes"], strict=True):
         shown = decoded(jpeg).astype(float)
         assert shown.shape[:2] == (y1 - y0, x1 - x0)
         differences = [np.abs(shown - image[y0:y1, x0:x1]).mean() for image in rendered]
@@ -113,14 +168,15 @@ def test_keypoints_lie_on_the_rendered_person_when_the_first_poses_were_left_out
 
 def test_the_crop_holds_the_keypoints(person, folder):
     motion = seen_at(person, np.round(np.arange(20) / 30.0 * 1e9))
-    x0, y0, x1, y1 = read_motion_images(folder, motion).box
-    inside = (motion.keypoints > (x0, y0)) & (motion.keypoints < (x1, y1))
+    boxes = np.array(read_motion_images(folder, motion).boxes)
+    inside = (motion.keypoints > boxes[:, None, :2]) & (motion.keypoints < boxes[:, None, 2:])
     assert inside.all()
-    assert (x1 - x0) * (y1 - y0) < 0.3 * 320 * 240
+    assert np.prod(boxes[:, 2:] - boxes[:, :2], axis=1).max() < 0.3 * 320 * 240
 
 
 def test_images_of_noise_stay_within_their_bytes(person, tmp_path, monkeypatch):
     monkeypatch.setattr(motion_images, "MAX_BYTES", 200_000)
+    monkeypatch.setattr(motion_images, "MAX_IMAGES", 20)
     rng = np.random.default_rng(0)
     for number in range(20):
         cv2.imwrite(str(tmp_path / f"{number:04d}.png"), rng.integers(0, 255, (480, 640, 3), np.uint8))

@@ -29,8 +29,9 @@ def pages(person, reported_in_camera, one_frame, tmp_path_factory):
     folder = tmp_path_factory.mktemp("pages")
     grey = cv2.imencode(".jpg", np.full((200, 150, 3), 90, np.uint8))[1].tobytes()
     low, high = np.nanmin(person.keypoints, axis=(0, 1)), np.nanmax(person.keypoints, axis=(0, 1))
-    box = (*(int(v) for v in low - 20), *(int(v) for v in high + 20))
-    images = MotionImages(tuple(range(0, 60, 3)), (grey,) * 20, box)
+    x0, y0, x1, y1 = (*(int(v) for v in low - 20), *(int(v) for v in high + 20))
+    boxes = tuple((x0 - number, y0, x1 + number, y1 + 3 * number) for number in range(20))
+    images = MotionImages(tuple(range(0, 60, 3)), (grey,) * 20, boxes)
     (folder / "images.html").write_text(render_report(person, images), encoding="utf-8")
     joints = person.joints3d.copy()
     joints[10:20] = np.nan
@@ -225,7 +226,7 @@ def test_the_body_is_drawn_at_its_keypoints_of_the_image(browser, pages, person,
         browser.run(f"arcs.length = 0; show({frame})")
         browser.settle()
         shown, arcs, box, size = browser.run(
-            """[images.places[images.nearest(state.frame)], arcs, imageBox,
+            """[images.places[images.nearest(state.frame)], arcs, images.boxes[images.nearest(state.frame)],
             [byId("image").clientWidth, byId("image").clientHeight]]"""
         )
         assert abs(shown - frame) <= 1  # every third frame has an image

@@ -27,9 +27,8 @@ const images = motion.image && {
   },
 };
 
-/** Part of the image that is shown: x_min, y_min, x_max, y_max px. */
-const imageBox = (() => {
-  if (images) return images.box;
+/** Part of the picture that is shown where there are no images: x_min, y_min, x_max, y_max px. */
+const keypointsBox = (() => {
   let box = [Infinity, Infinity, -Infinity, -Infinity];
   for (const { keypoints } of bodies) for (let i = 0; i < keypoints.length; i += 2) {
     const x = keypoints[i], y = keypoints[i + 1];
@@ -41,13 +40,13 @@ const imageBox = (() => {
 
 function drawImagePane(canvas, frame, showKeypoints, colours, redraw) {
   const { context, width, height } = prepared(canvas);
-  const [x0, y0, x1, y1] = imageBox;
+  const index = images && images.nearest(frame);
+  const [x0, y0, x1, y1] = images ? images.boxes[index] : keypointsBox;
   if (!(x1 > x0)) return;
   const scale = Math.min(width / (x1 - x0), height / (y1 - y0));
   const left = (width - scale * (x1 - x0)) / 2, top = (height - scale * (y1 - y0)) / 2;
   let shown = frame;
   if (images) {
-    const index = images.nearest(frame);
     // Keypoints are drawn on their own image, also where not every frame has one.
     shown = images.places[index];
     const image = images.decoded(index, redraw);
