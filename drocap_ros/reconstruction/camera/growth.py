@@ -84,7 +84,7 @@ class Growth:
     def grow(self, most: int) -> Grown:
         """Place keyframes on both sides until ``most`` are known or no more can be placed; adjust now and then."""
         due = _FIRST_KEYS
-        while int(self.path.known.sum()) < most and any(place() for place in self._ways()):
+        while int(self.path.known.sum()) < most and self.extend():
             if self.path.known.sum() >= due:
                 self.adjust()
                 due = int(_GROWTH * self.path.known.sum())
@@ -94,6 +94,10 @@ class Growth:
 
     def extend(self) -> bool:
         """Place the next keyframes by the points of the known ones; whether any could be placed."""
+        return any(place() for place in self._ways())
+
+    def _by_points(self) -> bool:
+        """Place the next keyframes by points whose depth is known; whether any could be placed."""
         placed = [self._place(key) for key in self._next_keys()]
         return any(placed)
 
@@ -110,7 +114,7 @@ class Growth:
         flat = self._flat
         seen = [flat[piece[usable]] for usable, piece, _ in map(self._matches, self._next_keys())]
         hovers = sum(int(of.sum()) for of in seen) > 0.5 * sum(map(len, seen))
-        return (self._on_ground, self.extend) if hovers else (self.extend, self._on_ground)
+        return (self._on_ground, self._by_points) if hovers else (self._by_points, self._on_ground)
 
     def _on_ground(self) -> bool:
         """Place the next keyframes by points that are taken to lie on the ground; whether any could be placed.
@@ -127,7 +131,7 @@ class Growth:
         away = (height[lying] / falls[lying])[:, None]
         # Rays from one place meet there: other points without depth would hold the camera fast.
         self.places[lying], self.usable[flat] = self._eye[lying] + away * self._ray[lying], lying[flat]
-        return self.extend()
+        return self._by_points()
 
     def _next_keys(self) -> list[int]:
         """Keyframes to try: those inside a pair first, then the next ones outside, or beyond a gap."""

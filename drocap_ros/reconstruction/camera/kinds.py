@@ -72,14 +72,17 @@ def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int)
     return Kind.MOVES
 
 
-def cut_at(sightings: Sightings) -> int | None:
-    """Keyframe at which no point of the one before goes on, though both see many; None = there is none."""
-    for key in range(1, len(sightings)):
-        before, after = sightings.at(key - 1)[0], sightings.at(key)[0]
-        if min(len(before), len(after)) < _LEAST_COMMON:
-            continue
-        if np.isin(after, before, assume_unique=True).sum() == 0:
-            return key
+def cut_at(sightings: Sightings, over_gaps: bool = False) -> int | None:
+    """Keyframe at which no point of that before goes on, or ``over_gaps`` of the last that sees many; None = none."""
+    before = None
+    for key in range(len(sightings)):
+        tracks = sightings.views.track[sightings.at(key)[0]]
+        if len(tracks) >= _LEAST_COMMON:
+            if before is not None and not np.isin(tracks, before).any():
+                return key
+            before = tracks
+        elif not over_gaps:
+            before = None
     return None
 
 

@@ -3,7 +3,7 @@
 A path begins as a recording's does (``camera/picture_world.py``): upright, in metres by the body.  The next window goes
 on with it: new keyframes are placed by its points, as a path grows offline, and images in the time of both windows keep
 their camera.  They need not be the same images: a late adjustment takes every second to fourth.  Where that fails, the
-path is lost, and another one begins at the last place and heading of the camera.
+path is lost, and another one begins.
 
 A path begins in a few seconds, in which a drone hovers or climbs: its up and its metres are badly known.  Where ground
 and feet of a later window contradict them, the path takes over theirs.
@@ -35,11 +35,10 @@ from drocap_ros.reconstruction.camera.upright import FEET_TELL, LEAST_SCALE_STD,
 from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
-from drocap_ros.reconstruction.live.window import Retry
+from drocap_ros.reconstruction.live.window import Retry, camera_path
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.world_model import WorldConfig
-from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
 #: Shortest window (s) in which a path begins: a step and some way, and points in most of it.
@@ -105,8 +104,6 @@ class PictureOdometry:
 
     def __init__(self) -> None:
         self._path: PicturePath | None = None
-        #: Where the last path ended: position (3,) m and rotation (3, 3) of the camera.
-        self._place: tuple[np.ndarray, np.ndarray] | None = None
         #: First image, by its stamp, of the next path.
         self.since_ns = 0
         self._number, self._retry = 0, Retry()
@@ -129,20 +126,24 @@ class PictureOdometry:
             self._path = self._begun(tracks, person, config)
         return self._path
 
+    def moved(self, about: np.ndarray, by: np.ndarray) -> PicturePath:
+        """The path turned by (3, 3) about the origin and moved by (3,) m; it goes on there."""
+        assert self._path is not None
+        rotation, position = camera_path(self._path.tracks)
+        there = replace(self._path.tracks, camera_rotation=rotation @ about.T, camera_position=position @ about.T + by)
+        self._path = replace(self._path, tracks=there)
+        return self._path
+
     def _lose(self, path: PicturePath, tracks: Tracks, shared: bool) -> None:
-        last = path.tracks
-        assert last.camera_position is not None
-        assert last.camera_rotation is not None
-        self._place = last.camera_position[-1], last.camera_rotation[-1]
-        seen = _Seen(tracks)
-        if (cut := cut_at(seen.sightings)) is not None:
+        last, seen = path.tracks, _Seen(tracks)
+        if (cut := cut_at(seen.sightings, over_gaps=True)) is not None:
             at, why = int(tracks.stamp_ns[seen.image[seen.knots.frame[cut]]]), "a cut"
         elif shared and (kind := seen.kind(last)).known:
             # A camera that begins to move, say: nothing is wrong with the images of before.
             at, why = int(tracks.stamp_ns[0]), f"it is {kind.value} now"
         else:
             at, why = int(last.stamp_ns[-1]), kind.value if shared else "a pause"
-        self.since_ns, self.lost = at, f"path {path.number} lost: {why}; another one begins at its end"
+        self.since_ns, self.lost = at, f"path {path.number} lost: {why}; another one begins"
         self.losses += 1
 
     def _begun(self, tracks: Tracks, person: Person, config: WorldConfig) -> PicturePath | None:
@@ -157,8 +158,6 @@ class PictureOdometry:
         if world.upright.scale_std > _LARGEST_SCALE_STD:
             self._pause("neither feet nor ground give its metres", tracks)
             return None
-        if self._place is not None:
-            tracks = _from(tracks, *self._place)
         self._number, self._retry = self._number + 1, Retry()
         scale = _way(tracks) / max(float(np.linalg.norm(np.ptp(camera.position, axis=0))), 1e-9)
         drift = np.nan_to_num([scale * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)
@@ -190,7 +189,7 @@ class _Seen:
         return kind_of(self.sightings, last.camera_matrix, 1.0 / self.knots.step_s, last.image_size[0])
 
 
-class _Held(NamedTuple):
+class Held(NamedTuple):
     """Images (N,) of a window in the time of the one before, and the camera there: rotations and positions (N,)."""
 
     image: np.ndarray
@@ -198,23 +197,22 @@ class _Held(NamedTuple):
     position: np.ndarray
 
 
-def _held(last: Tracks, stamp_ns: np.ndarray) -> _Held:
+def camera_there(last: Tracks, stamp_ns: np.ndarray) -> Held:
     """The camera of the window before, at those images of stamps (F,) that lie in its time."""
-    assert last.camera_rotation is not None
-    assert last.camera_position is not None
+    rotation, position = camera_path(last)
     inside = np.flatnonzero((stamp_ns >= last.stamp_ns[0]) & (stamp_ns <= last.stamp_ns[-1]))
     turn, place = (
         interpolate(last.stamp_ns, values, stamp_ns[inside], spherical=spherical, max_gap_s=_STRAIGHT_S)[0]
-        for values, spherical in ((quaternion_from_matrix(last.camera_rotation), True), (last.camera_position, False))
+        for values, spherical in ((quaternion_from_matrix(rotation), True), (position, False))
     )
     known = np.isfinite(place).all(axis=1)
-    return _Held(inside[known], matrix_from_quaternion(turn[known]), place[known])
+    return Held(inside[known], matrix_from_quaternion(turn[known]), place[known])
 
 
 def _continued(before: PicturePath, tracks: Tracks, person: Person) -> PicturePath | None:
     """The path of the window before in a window that shares time with it; None = it is lost."""
-    last, seen, held = before.tracks, _Seen(tracks), _held(before.tracks, tracks.stamp_ns)
-    if cut_at(seen.sightings) is not None or not len(held.image):
+    last, seen, held = before.tracks, _Seen(tracks), camera_there(before.tracks, tracks.stamp_ns)
+    if cut_at(seen.sightings, over_gaps=True) is not None or not len(held.image):
         return None
     tracks = replace(tracks, camera_matrix=last.camera_matrix)
     grown = _grown(seen, last, held) if before.world.camera.kind is Kind.MOVES else None
@@ -236,7 +234,7 @@ def _in_place(seen: _Seen, last: Tracks) -> tuple[np.ndarray, np.ndarray] | None
     return (turns(seen.sightings, last.camera_matrix)[0][seen.slot], place) if kind is Kind.TURNS else None
 
 
-def _grown(seen: _Seen, last: Tracks, held: _Held) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _grown(seen: _Seen, last: Tracks, held: Held) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Rotations, positions (F,) and points (J, 4) of a path that goes on, in a unit of its own; None = it does not."""
     assert last.camera_matrix is not None
     image = seen.image[seen.knots.frame]
@@ -259,12 +257,11 @@ def _grown(seen: _Seen, last: Tracks, held: _Held) -> tuple[np.ndarray, np.ndarr
     return found.rotation[at], found.position[at], found.points
 
 
-def _as_before(rotation: np.ndarray, position: np.ndarray, held: _Held) -> tuple[np.ndarray, np.ndarray]:
+def _as_before(rotation: np.ndarray, position: np.ndarray, held: Held) -> tuple[np.ndarray, np.ndarray]:
     """The path (F,) in the axes, at the place and in the metres that the window before has."""
     turn = project_to_so3(np.einsum("fki,fkj->ij", held.rotation, rotation[held.image]))
     place, theirs_at = position[held.image] @ turn.T, held.position
-    # The path keeps the metres that it began with: the adjustment may shrink it.  Only a way longer than the noise
-    # measures by how much.
+    # The path keeps its metres, though the adjustment may shrink it: a way longer than the noise measures by how much.
     spread, theirs_spread = (np.square(p - p.mean(axis=0)).sum(axis=1).mean() for p in (place, theirs_at))
     scale = float(np.sqrt((theirs_spread + _PLACE_M**2) / (spread + _PLACE_M**2)))
     moved = scale * (position @ turn.T - place.mean(axis=0)) + theirs_at.mean(axis=0)
@@ -272,14 +269,9 @@ def _as_before(rotation: np.ndarray, position: np.ndarray, held: _Held) -> tuple
 
 
 def _corrected(path: PicturePath, grown: tuple[np.ndarray, np.ndarray, np.ndarray], person: Person) -> PicturePath:
-    """The path in the metres at which the window's feet rest, and upright by its ground, where its own contradict them.
-
-    The person stays in place.
-    """
+    """The path in metres at which the window's feet rest, and upright by its ground, where its own contradict them."""
     tracks, upright = path.tracks, path.world.upright
-    rotation, position = tracks.camera_rotation, tracks.camera_position
-    assert rotation is not None
-    assert position is not None
+    rotation, position = camera_path(tracks)
     assert upright is not None
     seen = seen_from_camera(tracks, person.poses, person.metres_per_px(tracks))
     scale = by_contacts((seen @ rotation)[:, ANKLES], position, tracks.stamp_ns)
@@ -288,61 +280,38 @@ def _corrected(path: PicturePath, grown: tuple[np.ndarray, np.ndarray, np.ndarra
     if scale is not None and scale.std < FEET_TELL and LEAST_SCALE_STD < abs(np.log(scale.factor)) < _MOST_SCALE:
         factor = scale.factor
         upright = upright._replace(scale_std=max(scale.std, LEAST_SCALE_STD))
-    pelvis = seen[-1, BODY_17.index("pelvis")]
-    floor = (position[-1] + pelvis @ rotation[-1]) * [1.0, 1.0, 0.0]
     up = rotation[-1].T @ fresh.rotation[-1, :, 2]
     tilt = np.arccos(np.clip(up[2], -1.0, 1.0))
     if fresh.source is UpSource.GROUND and tilt > np.deg2rad(_TILTED_DEG):
         across = np.cross(up, [0.0, 0.0, 1.0])
         turn = exp_so3(tilt * across / np.linalg.norm(across))
         # The floor is where the ground is.
-        lift = fresh.position[-1, 2] - factor * (turn @ (position[-1] - floor))[2]
+        lift = fresh.position[-1, 2] - factor * (turn @ position[-1])[2]
         upright = upright._replace(source=fresh.source, std_deg=fresh.std_deg)
     if upright is path.world.upright:
         return path
-    place = floor + factor * (position - floor) @ turn.T + [0.0, 0.0, lift]
+    place = factor * position @ turn.T + [0.0, 0.0, lift]
     tracks = replace(tracks, camera_rotation=rotation @ turn.T, camera_position=place)
     world = replace(path.world, upright=upright)
     return replace(path, tracks=tracks, world=world, corrections=path.corrections + 1)
 
 
-def _from(tracks: Tracks, position: np.ndarray, rotation: np.ndarray) -> Tracks:
-    """A path turned about the vertical and moved across it, so that its first image has that place and heading."""
-    turns_, path = tracks.camera_rotation, tracks.camera_position
-    assert turns_ is not None
-    assert path is not None
-    ahead, wanted = _heading(turns_[0]), _heading(rotation)
-    c, s = np.cos(wanted - ahead), np.sin(wanted - ahead)
-    about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    moved = path @ about.T
-    moved[:, :2] += position[:2] - moved[0, :2]
-    return replace(tracks, camera_rotation=turns_ @ about.T, camera_position=moved)
-
-
-def _heading(rotation: np.ndarray) -> float:
-    """Angle (rad) of a camera's axis (3, 3) in the level plane, or of its image's top where it looks down."""
-    ahead = rotation[2] if np.hypot(*rotation[2, :2]) > np.hypot(*rotation[1, :2]) else -rotation[1]
-    return float(np.arctan2(ahead[1], ahead[0]))
-
-
 def _way(tracks: Tracks) -> float:
-    assert tracks.camera_position is not None
-    return float(np.linalg.norm(np.ptp(tracks.camera_position, axis=0)))
+    return float(np.linalg.norm(np.ptp(camera_path(tracks)[1], axis=0)))
 
 
 def own_covariance(path: PicturePath, joints: np.ndarray, stature_std: float) -> np.ndarray:
     """(F, P, 3, 3) m^2 of joints (F, P, 3) m in ``odom`` by what is unknown of the path: up, metres and drift."""
     tracks, upright = path.tracks, path.world.upright
     assert upright is not None
-    assert tracks.camera_rotation is not None
-    assert tracks.camera_position is not None
+    rotation, position = camera_path(tracks)
     moves = np.isfinite(upright.scale_std)
     # A way has an unknown factor as a whole; without one the distance of a person of unknown stature is unknown.
-    arm = joints if moves else joints - tracks.camera_position[:, None]
+    arm = joints if moves else joints - position[:, None]
     out = (upright.scale_std if moves else stature_std) ** 2 * arm[..., :, None] * arm[..., None, :]
     tilted = hat(joints)[..., :2]
     out += np.deg2rad(upright.std_deg) ** 2 * (tilted @ np.swapaxes(tilted, -1, -2))
-    lever = joints_by_camera(joints, tracks.camera_rotation, tracks.camera_position)
+    lever = joints_by_camera(joints, rotation, position)
     seconds = np.maximum(tracks.stamp_ns - path.begun_ns, 0) * 1e-9
     drift = seconds[:, None] * np.repeat([path.drift_m, path.drift_rad], 3) ** 2
     return np.asarray(out + (lever * drift[:, None, None]) @ np.swapaxes(lever, -1, -2))

@@ -7,12 +7,24 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.geometry.ellipsoids import pack_covariance, unpack_covariance
+from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.camera.picture_world import seen_from_camera
+from drocap_ros.reconstruction.camera.resection import LEAST_POINTS
+from drocap_ros.reconstruction.camera.views import LEAST_VIEWS
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.method import WindowSolution
-from drocap_ros.reconstruction.live.picture_odometry import Person, PictureOdometry, PicturePath, own_covariance
-from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Window
+from drocap_ros.reconstruction.live.picture_odometry import (
+    Held,
+    Person,
+    PictureOdometry,
+    PicturePath,
+    camera_there,
+    own_covariance,
+)
+from drocap_ros.reconstruction.live.view_forecast import facing_deg
+from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Window, camera_path
 from drocap_ros.reconstruction.live.world_chain import WorldChain
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import place_in_world
@@ -20,6 +32,11 @@ from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
+
+#: Time (s) at a window's end in which the person's place there is compared with that in another one.
+_NEWEST_S = 1.5
+#: Time (s) in which a person's speed is forgotten: that of people who walk and stand is to 0.4 the same after 2.5 s.
+_SPEED_S = 3.0
 
 
 class PictureWindows:
@@ -30,6 +47,7 @@ class PictureWindows:
         self._length_ns = round(config.world_window_s * 1e9)
         self._odometry, self._chain = PictureOdometry(), WorldChain()
         self._of: tuple[int, int, int] | None = None  # subject, path and corrections of the chain
+        self._last: tuple[AdjustedWindow, Tracks] | None = None  # in `odom`, with its path
 
     def adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
         """The window's result in ``odom``, or that in the camera's axes with the reason.
@@ -39,9 +57,14 @@ class PictureWindows:
         if w.background is None:
             return camera_result
         if w.stamp_ns[-1] < self._odometry.since_ns:  # another pass of time
-            self._odometry = PictureOdometry()
-        newest_ns = int(w.stamp_ns[-1])
-        use = slice(int(np.searchsorted(w.stamp_ns, max(newest_ns - self._length_ns, self._odometry.since_ns))), None)
+            self._odometry, self._last = PictureOdometry(), None
+        since_ns = max(int(w.stamp_ns[-1]) - self._length_ns, self._odometry.since_ns)
+        first = int(np.searchsorted(w.stamp_ns, since_ns))
+        # Nothing tells where the camera is in the images behind the last one with points: later ones may.
+        seeing = np.flatnonzero(np.bincount(w.background.frame) >= LEAST_POINTS)
+        use = slice(first, seeing[-1] + 1 if len(seeing) else len(w.stamp_ns))
+        if use.stop - first < LEAST_VIEWS:
+            return replace(camera_result, picture=self._odometry.lost)
         tracks = _tracks(w.frames(use))
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
         had = self._odometry.losses
@@ -50,21 +73,30 @@ class PictureWindows:
         lost, why = self._odometry.losses > had, self._odometry.lost
         if path is None:
             return replace(camera_result, picture=why, lost=lost)
-        of = w.subject, path.number, path.corrections
-        if self._of != of:
+        of, before, last = (w.subject, path.number, path.corrections), self._of, self._last
+        same = before is not None and before[0] == w.subject
+        if before != of:
             self._of, self._chain = of, WorldChain()
-        placed = self._placed(path, person, w.keypoints[use], camera_result)
+        if last is not None and before is not None and before[1:] != of[1:]:
+            path = self._odometry.moved(*_onward(*last, path.tracks, person if same else None))
+        placed = self._placed(path, person, w.keypoints[use], camera_result, use)
+        if last is not None and same and before != of:
+            # A path begins or is corrected about the person, whom both windows see.
+            by = _beside(last[0], placed)
+            path = self._odometry.moved(np.eye(3), by)
+            self._chain.move(by)
+            assert placed.in_map is not None
+            there = placed.in_map._replace(position=placed.in_map.position + by)
+            placed = replace(placed, joints3d=placed.joints3d + by, in_map=there)
+        self._last = placed, path.tracks
         return replace(placed, picture=f"{path.words}; {why}" if lost else path.words, lost=lost)
 
     def _placed(
-        self, path: PicturePath, person: Person, keypoints: Keypoints2D, seen: AdjustedWindow
+        self, path: PicturePath, person: Person, keypoints: Keypoints2D, seen: AdjustedWindow, use: slice
     ) -> AdjustedWindow:
-        """The window's last images, those of the path, in ``odom``; ``seen`` : all of it in camera axes."""
+        """The window's images ``use``, those of the path, in ``odom``; ``seen`` : all of it in camera axes."""
         poses, tracks, config = person.poses, path.tracks, path.world.config
-        use = slice(len(seen.stamp_ns) - len(keypoints), None)
-        rotation, position = tracks.camera_rotation, tracks.camera_position
-        assert rotation is not None
-        assert position is not None
+        rotation, position = camera_path(tracks)
         per_px = person.metres_per_px(tracks)
         refined = None
         if config is not None:
@@ -89,6 +121,40 @@ class PictureWindows:
             reprojection_rms_px=seen.reprojection_rms_px[use],
             in_map=InMap(rotation, position, np.zeros(6), path.number),
         )
+
+
+def _onward(last: AdjustedWindow, theirs: Tracks, ours: Tracks, same: Person | None) -> tuple[np.ndarray, np.ndarray]:
+    """Turn (3, 3) about the vertical and way (3,) m across it, by which a path goes on from the last window's.
+
+    In the images of both the camera is where it was.  Where there are none, the ``same`` person faces as before, and
+    the camera begins where the other path ended.
+    """
+    (rotation, position), both = camera_path(ours), camera_there(theirs, ours.stamp_ns)
+    shared = len(both.image) > 0
+    if not shared:
+        both = Held(np.zeros(1, int), *(values[-1:] for values in camera_path(theirs)))
+    turned = np.einsum("fki,fkj->ij", both.rotation, rotation[both.image])
+    yaw = float(np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1]))
+    if same is not None and not shared:
+        newest = last.stamp_ns >= last.stamp_ns[-1] - round(_NEWEST_S * 1e9)
+        oldest = ours.stamp_ns <= ours.stamp_ns[0] + round(_NEWEST_S * 1e9)
+        seen = seen_from_camera(ours, same.poses, same.metres_per_px(ours)) @ rotation
+        yaw = np.deg2rad(facing_deg(last.joints3d[newest], 1.0)[0] - facing_deg(seen[oldest][::-1], 1.0)[0])
+    about = exp_so3(np.array([0.0, 0.0, yaw]))
+    return about, (both.position - position[both.image] @ about.T).mean(axis=0) * [1.0, 1.0, 0.0]
+
+
+def _beside(last: AdjustedWindow, placed: AdjustedWindow) -> np.ndarray:
+    """(3,) m across the vertical from a window's person to where the last window has the same person.
+
+    In the newest images of the last window that both have; where there are none, the person has gone on for a while.
+    """
+    theirs_s, ours_s = ((stamps - last.stamp_ns[-1]) * 1e-9 for stamps in (last.stamp_ns, placed.stamp_ns))
+    late, both = theirs_s >= -_NEWEST_S, (ours_s >= -_NEWEST_S) & (ours_s <= 0.0)
+    speed, place = np.polyfit(theirs_s[late], last.joints3d[late, 0, :2], 1)
+    passed_s = ours_s[both] if both.any() else _SPEED_S * (1.0 - np.exp(-ours_s[:1] / _SPEED_S))
+    ours = placed.joints3d[both if both.any() else slice(1), 0, :2]
+    return np.append((place + passed_s[:, None] * speed - ours).mean(axis=0), 0.0)
 
 
 def _tracks(w: Window) -> Tracks:

@@ -61,7 +61,7 @@ class ViewForecaster:
         even = np.arange(slots[-1] + 1)
         flat = joints[recent].reshape(len(slots), -1)
         body = np.stack([np.interp(even, slots, values) for values in flat.T], axis=-1).reshape(len(even), -1, 3)
-        facing, turn = _facing_deg(body, fps)
+        facing, turn = facing_deg(body, fps)
         views = [(facing + bearing, elevation) for elevation in ELEVATIONS_DEG for bearing in BEARINGS_DEG]
         new = np.log([_expected_error(body, np.radians(view), fps, self._lifter) for view in views])
         share = 1.0 - math.exp(-max(int(stamp_ns[-1]) - self._stamp_ns, 0) / (_MEMORY_S * NS))
@@ -95,7 +95,7 @@ def _expected_error(body: np.ndarray, view: np.ndarray, fps: float, lifter: Lift
     return float(np.sqrt((np.square(gap) + np.square(own)).sum(axis=-1).mean()))
 
 
-def _facing_deg(body: np.ndarray, fps: float) -> tuple[float, float]:
+def facing_deg(body: np.ndarray, fps: float) -> tuple[float, float]:
     """Where the left sides of hips and shoulders of poses (F, 17, 3) point at last, deg, and how fast they turn, deg/s.
 
     Both are those of a straight line through all poses: one who moves his arms twists his trunk to and fro.

@@ -12,6 +12,7 @@ from drocap_ros.background import Background
 from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.tracks import Tracks
 
 #: Share of the allowed time above which the next window gets coarser: a tenth is left for its spread.
 _TOO_LONG = 0.9
@@ -172,3 +173,10 @@ class AdjustedWindow:
     picture: str = ""
     lost: bool = False
     in_map: InMap | None = None
+
+
+def camera_path(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (F, 3, 3) world -> camera and positions (F, 3) m of tracks that have a camera's path."""
+    assert tracks.camera_rotation is not None
+    assert tracks.camera_position is not None
+    return tracks.camera_rotation, tracks.camera_position

@@ -15,6 +15,7 @@ from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.live.window import camera_path
 from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.refine import Before, RefinedWorld
@@ -48,6 +49,13 @@ class WorldChain:
     def of_scale(self, stamp_ns: np.ndarray) -> None:
         """The next window, of these stamps, has another source of the camera: the scale alone stays known."""
         self._known, self._last = self._prior(stamp_ns).of_scale(), None
+
+    def move(self, by: np.ndarray) -> None:
+        """The last window lies (3,) m beside where it was, and the next one continues it there."""
+        if self._last is not None:
+            before, found, tracks = self._last
+            there = replace(tracks, camera_position=camera_path(tracks)[1] + by)
+            self._last = _Last(before._replace(joints=before.joints + by), found, there)
 
     def steps(self, config: WorldConfig, stamp_ns: np.ndarray) -> WorldConfig:
         """The configuration with the steps of a window of these stamps."""
@@ -96,10 +104,7 @@ class WorldChain:
         before, theirs = last.before, last.tracks
         wander = before.wander.copy()
         at, here = (np.isin(a, b) for a, b in itertools.permutations((before.stamp_ns, tracks.stamp_ns)))
-        assert tracks.camera_position is not None
-        assert tracks.camera_rotation is not None
-        assert theirs.camera_position is not None
-        assert theirs.camera_rotation is not None
-        wander[at, :3] += theirs.camera_position[at] - tracks.camera_position[here]
-        wander[at, 3:] += log_so3(theirs.camera_rotation[at] @ np.swapaxes(tracks.camera_rotation[here], 1, 2))
+        (turn, place), (their_turn, their_place) = camera_path(tracks), camera_path(theirs)
+        wander[at, :3] += their_place[at] - place[here]
+        wander[at, 3:] += log_so3(their_turn[at] @ np.swapaxes(turn[here], 1, 2))
         return before._replace(wander=wander)

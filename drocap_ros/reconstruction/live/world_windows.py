@@ -21,7 +21,7 @@ from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.method import WindowSolution
 from drocap_ros.reconstruction.live.fused_camera import FusedCamera
-from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, TelemetryUse, Window
+from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, TelemetryUse, Window, camera_path
 from drocap_ros.reconstruction.live.world_chain import WorldChain
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.findings import Findings
@@ -179,7 +179,6 @@ def _ground(fused: FusedTelemetry, poses: ImagePoses, per_px: np.ndarray) -> Fin
 
 
 def _correction(refined: RefinedWorld, tracks: Tracks) -> np.ndarray:
-    assert tracks.camera_rotation is not None
-    assert tracks.camera_position is not None
-    turned = refined.rotation[-1:] @ np.swapaxes(tracks.camera_rotation[-1:], 1, 2)
-    return np.concatenate([refined.position[-1] - tracks.camera_position[-1], log_so3(turned)[0]])
+    rotation, position = camera_path(tracks)
+    turned = refined.rotation[-1:] @ np.swapaxes(rotation[-1:], 1, 2)
+    return np.concatenate([refined.position[-1] - position[-1], log_so3(turned)[0]])

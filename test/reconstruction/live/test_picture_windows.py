@@ -13,11 +13,13 @@ from telemetry_stream import FPS, Orbit, orbit
 
 from drocap_ros.background import Background
 from drocap_ros.evaluation.compare import world_errors
+from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.replay import LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import Effort, TelemetryUse
+from drocap_ros.skeleton import BODY_17
 
 S = 10**9
 
@@ -122,7 +124,7 @@ def test_a_path_takes_over_the_metres_and_the_up_of_later_windows(smaller: float
     assert abs(there[-1].joints3d[:, :, 2].min()) < 0.2  # the floor stays
 
 
-def test_a_path_that_a_cut_ends_is_told_and_the_next_one_begins_at_its_place() -> None:
+def test_a_path_that_a_cut_ends_is_told_and_the_person_goes_on_from_it_to_the_next_one() -> None:
     true, other = flown(), orbit(9.0, seed=3)
     cut_ns = int(true.stamp_ns[0]) + 5 * S
     cut = int(np.searchsorted(true.stamp_ns, cut_ns))
@@ -144,8 +146,41 @@ def test_a_path_that_a_cut_ends_is_told_and_the_next_one_begins_at_its_place() -
     assert "path 1 lost: a cut" in lost[0].window.picture
     last, first = found[max(i for i, p in enumerate(paths) if p == 1)], found[paths.index(2)]
     assert first.window.stamp_ns[0] >= cut_ns
-    # Where the camera was, though its scene is another one.
-    np.testing.assert_allclose(camera_of(first)[1][0, :2], camera_of(last)[1][-1, :2], atol=0.2)
+    seconds = (first.window.stamp_ns[0] - last.window.stamp_ns[-1]) * 1e-9
+    assert np.linalg.norm(first.joints3d[0, 0] - last.joints3d[-1, 0]) < 0.2 + 2.0 * seconds
+    assert abs(turned_deg(across(last.joints3d[-1]), across(first.joints3d[0]))) < 30.0
+
+
+def across(body: np.ndarray) -> np.ndarray:
+    """From the right shoulder to the left one, (2,)."""
+    left, right = (BODY_17.index(name) for name in ("lshoulder", "rshoulder"))
+    return body[left, :2] - body[right, :2]
+
+
+def turned_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b)))
+
+
+def test_a_path_behind_a_pause_of_the_points_begins_where_the_person_has_gone_meanwhile() -> None:
+    true = orbit(10.5)
+    image, hidden = true.background.frame, slice(round(5.0 * FPS), round(7.0 * FPS))
+    seen = (image < hidden.start) | (image >= hidden.stop)
+    track = true.background.track + 10**6 * (image >= hidden.stop)  # nothing is known again
+    points = Background(image[seen], track[seen], true.background.point[seen])
+    found = windows(true, lambda stamps: points.of_frames(np.searchsorted(true.stamp_ns, stamps)), Effort(2))
+    there = [w for w in found if w.window.in_map is not None]
+    paths = [w.window.in_map.path for w in there if w.window.in_map is not None]
+    assert sorted(set(paths)) == [1, 2]
+    last, first = there[paths.index(2) - 1], there[paths.index(2)]
+    assert (
+        last.window.stamp_ns[-1] < true.stamp_ns[hidden.start] < true.stamp_ns[hidden.stop] <= first.window.stamp_ns[0]
+    )
+    before, after = (true.truth[np.searchsorted(true.stamp_ns, w.window.stamp_ns)] for w in (last, first))
+    fit = similarity(last.joints3d.astype(float).reshape(-1, 3), before.reshape(-1, 3), with_scale=False)
+    body = apply_similarity(first.joints3d[0].astype(float), *fit)
+    # The camera has turned by 52 degrees and gone over 5 m.
+    assert np.linalg.norm(body[0] - after[0, 0]) < 0.7 * np.linalg.norm(before[-1, 0] - after[0, 0])
+    assert abs(turned_deg(across(body), across(after[0]))) < 20.0
 
 
 def test_without_texture_there_is_no_path_and_the_poses_stay_with_the_camera() -> None:
