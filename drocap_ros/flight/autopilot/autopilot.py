@@ -15,7 +15,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, coast_of
 from drocap_ros.flight.autopilot.setpoint import Setpoint
@@ -252,7 +251,7 @@ class Autopilot:
     def mode_parameters(self, mode: str) -> tuple[float, ...]:
         """The seven parameters of MAV_CMD_DO_SET_MODE."""
         main, sub = self.mode_numbers(mode)
-        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(main), float(sub), 0.0, 0.0, 0.0, 0.0)
+        return (1.0, float(main), float(sub), 0.0, 0.0, 0.0, 0.0)  # 1: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
     @property
     def loss_names(self) -> tuple[str, ...]:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.frames import orientation_to_aviation, orientation_to_ros, quaternion_from_euler, yaw_of
 from drocap_ros.geometry.rotations import quaternion_multiply
@@ -16,9 +15,6 @@ from drocap_ros.geometry.rotations import quaternion_multiply
 MOUNT_TYPES = {"fixed": 0, "servo": 1, "gimbal": 6}
 _LIMITS_DEG = (-90.0, 30.0)
 _SERVO_LAG_S = 0.06  # s: a hobby servo turns 60 deg in 0.1 to 0.2 s; assumed
-#: ArduPilot sets the first two for every mount, servos included.
-_LOCKED = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
-_YAW_FROM_NOSE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 
 
 class MountReport(NamedTuple):
@@ -69,13 +65,17 @@ class SimulatedMount:
 
         body_xyzw : (4,) FLU -> ENU as the autopilot estimates it
         """
+        from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
         if self.kind == "fixed":
             return None
         pitch, yaw = self._demanded(body_xyzw), 0.0
         if self.kind == "gimbal":
             pitch, yaw = self.pitch + gimbal_error_rad[0], gimbal_error_rad[1]
         x, y, z, w = quaternion_from_euler(0.0, pitch, yaw)
-        return MountReport(np.array([w, x, y, z]), int(_LOCKED | _YAW_FROM_NOSE))
+        # ArduPilot sets the first two for every mount, servos included.
+        locked = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
+        return MountReport(np.array([w, x, y, z]), int(locked | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME))
 
     def _demanded(self, body_xyzw: np.ndarray) -> float:
         """rad, angle of the servo: what is wanted, less the body's pitch."""
