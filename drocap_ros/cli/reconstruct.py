@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 METHODS = (*OFFLINE, "live")
 #: Stages of the work on a video and their shares of its time, as of a walk of 8 s.
-_SHARES = {"persons": 0.03, "2D pose": 0.75, "time offset": 0.02, "live": 0.05, "ba": 0.05, "report": 0.1}
+_SHARES = {"persons": 0.03, "2D pose": 0.8, "time offset": 0.02, "live": 0.05, "ba": 0.07, "report": 0.03}
 
 
 def add_parser(subparsers: Subparsers) -> None:

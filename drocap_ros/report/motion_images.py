@@ -110,7 +110,10 @@ class ImagesBeside(AbstractContextManager["ImagesBeside"]):
         """The images of the motion; they are read now where they were not kept, and nobody has begun."""
         if self._read is None:
             self.begin(motion, motion.meta)
-        return self._kept_of(motion) if self._read is None else self._read.result()
+        if self._read is not None:
+            return self._read.result()
+        self._progress("report", 1.0)
+        return self._kept_of(motion)
 
     def _kept_of(self, tracks: Tracks | Motion) -> MotionImages | None:
         """The kept images; None where they are not one for each row, as of a recording that holds its poses."""

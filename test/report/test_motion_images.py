@@ -88,12 +88,14 @@ def test_images_kept_with_their_poses_are_those_that_a_second_reading_finds(walk
     folder, motion = walk
     monkeypatch.setattr(motion_images, "MAX_IMAGES", 30)
     expected = read_motion_images(folder, motion)
-    with ImagesBeside(folder, lambda *_: None, waiting) as images:
+    done = []
+    with ImagesBeside(folder, lambda *now: done.append(now), waiting) as images:
         keep_all(images, folder, motion)
         for number in range(40):
             (folder / f"{number:04d}.png").unlink()
         images.begin(motion, motion.meta)
         assert images.of(motion) == expected
+    assert done == [("report", 1.0)]
 
 
 @pytest.mark.parametrize("most", [39, 25])
