@@ -82,8 +82,7 @@ class MotionCheck(Enum):
     )
     LOW_RATE = (
         "Low image rate",
-        "{rate:.1f} images per second. Fast motions fall between the images, so the joints err more. Record at"
-        " {limit:.0f} or more.",
+        "{rate:.1f} images per second. Fast motions fall between, so joints err more. Record at {limit:.0f} or more.",
     )
     HIGH_ERROR = (
         "High reprojection error",
