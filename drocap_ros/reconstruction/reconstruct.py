@@ -13,6 +13,7 @@ from drocap_ros import __version__
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.balance import balanced
 from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
 from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, with_causes
 from drocap_ros.reconstruction.camera.kinds import Kind
@@ -21,6 +22,7 @@ from drocap_ros.reconstruction.camera.picture_world import (
     picture_camera,
     with_camera,
 )
+from drocap_ros.reconstruction.camera.upright import UpSource
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -246,7 +248,7 @@ def _solved(
     if poses is None:
         unsure = isinstance(known, SharedCamera) and known.config is None
         seen = dataclasses.replace(tracks, camera_rotation=None, camera_position=None) if unsure else tracks
-        poses = _solve(seen, keypoints, settings)
+        poses = _solve(seen, keypoints, settings, _points_tell_up(known))
     solved = time.perf_counter()
     body = in_metres(tracks, keypoints, poses, settings, known)
     return body if isinstance(body, Refusal) else _Solved(poses, body, solved, tracks, known, settings.lens)
@@ -270,11 +272,28 @@ def _with_picture(
     poses = _solve(tracks, keypoints, settings)
     per_px = metres_per_px(poses.joints_px, tracks.stamp_ns, settings.initializer.assumed_height_m)
     seen = aside(poses, camera.matrix) if by_place(tracks, settings) else poses
-    tracks, world = with_camera(tracks, camera, seen, per_px, world_config(settings.adjuster))
-    return tracks, world, settings, poses if world.config is None else None
+    placed, world = with_camera(tracks, camera, seen, per_px, world_config(settings.adjuster))
+    if world.config is None:
+        return placed, world, settings, poses
+    if world.upright is not None and world.upright.source is UpSource.GROUND:
+        # Poses that know up do not lean, and tell how far away they are.
+        poses = _solve(placed, keypoints, settings, points_tell_up=True)
+        per_px = metres_per_px(
+            true_shape(poses.in_image, camera.matrix), tracks.stamp_ns, settings.initializer.assumed_height_m
+        )
+        placed, world = with_camera(tracks, camera, poses, per_px, world_config(settings.adjuster))
+        return placed, world, settings, poses
+    return placed, world, settings, None
 
 
-def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: Settings) -> ImagePoses:
+def _points_tell_up(source: Source) -> bool:
+    """Whether fixed points have measured the camera's pitch: else a body that leans may tell of a wrong one."""
+    if isinstance(source, SharedCamera):
+        return source.config is not None and (source.words is not None or source.covariance is not None)
+    return isinstance(source, FusedTelemetry)
+
+
+def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: Settings, points_tell_up: bool = False) -> ImagePoses:
     """Poses in px by the method."""
     k, adjuster = tracks.camera_matrix, settings.adjuster
     if refinable(tracks):
@@ -297,7 +316,11 @@ def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: Settings) -> ImageP
     poses = run_method(settings.method, data)
     if not np.isfinite(poses.joints_px).all(axis=(1, 2)).any():
         raise InputError("keypoints: expected those of a person, got none that give a finite pose; check the values")
-    return poses if view is None else view.in_image(poses)
+    if view is None:
+        return poses
+    if points_tell_up and data.rotation is not None:
+        poses = balanced(poses, data.rotation, tracks.stamp_ns)
+    return view.in_image(poses)
 
 
 def _meta(poses: ImagePoses, settings: Settings) -> dict[str, object]:
