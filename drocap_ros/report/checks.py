@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -99,7 +99,6 @@ class MotionCheck(Enum):
         "The lower foot moves at {speed:.2f} m/s (median); the foot of a person that walks or stands rests. The path,"
         " the scale or the depths are wrong, or the person glides.",
     )
-    PATH_OFF_FEET = ("Path off the feet", "The camera's path is {off:.1f} m off its way over the feet; or these glide.")
     LEANING = (
         "Body leans with the camera",
         "From every side the body leans {lean:.0f}° {where} the camera. The camera's reported pitch is wrong by about"
@@ -156,7 +155,7 @@ class Finding:
 
 
 #: Checks that alone make a motion doubtful.
-_DOUBTFUL = (MotionCheck.MIRRORED, MotionCheck.HIGH_ERROR, MotionCheck.SLIDING_FEET, MotionCheck.PATH_OFF_FEET)
+_DOUBTFUL = (MotionCheck.MIRRORED, MotionCheck.HIGH_ERROR, MotionCheck.SLIDING_FEET)
 
 
 def run_checks(motion: Motion, s: Statistics) -> list[Finding]:
@@ -248,8 +247,6 @@ def _of_path(s: Statistics) -> Iterator[Finding]:
 def _of_frame(motion: Motion) -> Iterator[Finding]:
     if motion.frame != "world":
         yield _note(MotionCheck.NO_VERTICAL)
-    if isinstance(camera := motion.meta.get("camera"), Mapping) and (off := camera.get("off_feet_m")):
-        yield _warn(MotionCheck.PATH_OFF_FEET, off=off)
     if not motion.metric:
         height = motion.meta.get("assumed_height_m")
         assumed = f" of {height:.2f} m" if isinstance(height, int | float) else ""

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drocap_ros.contacts import ANKLES
 from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
 from drocap_ros.reconstruction.camera.fusion import with_camera_errors
-from drocap_ros.reconstruction.camera.upright import Upright, off_feet, set_upright
+from drocap_ros.reconstruction.camera.upright import Upright, set_upright
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.world.even_capture import LEAST_FRAMES
@@ -40,14 +39,12 @@ class PictureWorld:
     upright : its path in the world; None = the camera is not known
     config : of the adjustment of body and camera with it; None = up is unsure, and the body stays as it is seen
     errors : (F, 6, 6) covariance of its position (m) and rotation (rad) about the path's mean; None = unknown
-    off_feet_m : RMS distance of the path from the way over the feet, where it is more than chance
     """
 
     camera: PictureCamera
     upright: Upright | None = None
     config: WorldConfig | None = None
     errors: np.ndarray | None = None
-    off_feet_m: float = 0.0
 
     def meta(self) -> dict[str, object]:
         """JSON-compatible: where the world comes from."""
@@ -68,7 +65,7 @@ class PictureWorld:
                 "up_words": upright.source.value,
                 "up_std_deg": upright.std_deg,
                 "scale_std": _number(upright.scale_std),
-            } | ({"off_feet_m": self.off_feet_m} if self.off_feet_m else {})
+            }
         return found
 
 
@@ -112,13 +109,7 @@ def with_camera(
         corrected=True,
     )
     sure = upright.std_deg < _SURE_UP_DEG
-    off = off_feet((seen @ upright.rotation)[:, ANKLES], upright.position, tracks.stamp_ns)
-    off_m = 0.0 if off is None else float(np.sqrt(np.square(off).sum(axis=1).mean()))
-    errors = _errors(camera, upright.position)
-    if off is not None and errors is not None:
-        # The points are sure of a path that collapsed: what holds it is as far off as feet say, and not only now.
-        errors[:, :3, :3] += np.maximum(np.square(off).mean(axis=1), off_m**2 / 3.0)[:, None, None] * np.eye(3)
-    return world, PictureWorld(camera, upright, config if sure else None, errors, off_m)
+    return world, PictureWorld(camera, upright, config if sure else None, _errors(camera, upright.position))
 
 
 def _errors(camera: PictureCamera, position: np.ndarray) -> np.ndarray | None:

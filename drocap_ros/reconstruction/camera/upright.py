@@ -43,8 +43,6 @@ _GROUND_M = 15.0
 #: Times (s) between two places of a foot that rests, and error (m) of its place.
 _REST_S = 0.25
 _REST_M = 0.05
-#: RMS over that by chance from which feet contradict a path: one way of chance in 2000 reaches it.
-_CONTRADICTED = 2.0
 #: Steps of reweighting.
 _STEPS = 10
 #: Least standard deviation (degrees) of up: ground is no water level.
@@ -212,24 +210,6 @@ def body_up(joints: np.ndarray) -> tuple[np.ndarray, float]:
         weight = 1.0 / (1.0 + np.square(off / _LEANS_DEG)) ** 2
         up = _unit(weight @ each)
     return up, max(_BODY_STD_DEG, 0.3 * float(np.median(off)))
-
-
-def off_feet(feet: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray | None:
-    """(F, 3) m by which a path (F, 3) is off the camera's way over feet (F, 2, 3) m from it, about the mean.
-
-    The foot that moves less is the one that stands.  None = no more than by chance: a foot's place errs at both ends of
-    each step, and the path is kept where nobody is seen.
-    """
-    every = np.arange(stamp_ns[0], stamp_ns[-1] + 1, round(_REST_S * 1e9))
-    at = np.unique(np.searchsorted(stamp_ns, every))
-    seconds = np.diff(stamp_ns[at]) * 1e-9
-    steps = np.diff(position[at, None] + feet[at], axis=0)
-    moves = np.square(steps).sum(axis=-1)
-    stands = np.where((seconds < 2.0 * _REST_S)[:, None], steps[np.arange(len(steps)), moves.argmin(axis=1)], 0.0)
-    way = np.concatenate([np.zeros((1, 3)), np.cumsum(stands, axis=0)])
-    off = np.stack([np.interp(stamp_ns, stamp_ns[at], column) for column in (way - way.mean(axis=0)).T], axis=1)
-    by_chance = 2.0 * FEET_HZ * _FOOT_STD_M**2 * seconds.sum() / 6.0
-    return off if np.ptp(position) and np.square(off).mean() > _CONTRADICTED**2 * by_chance else None
 
 
 def resting(feet: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
