@@ -75,9 +75,9 @@ def balanced(poses: ImagePoses, rotation: np.ndarray, stamp_ns: np.ndarray) -> I
         weight = 1.0 / (1.0 + np.square(lean / _LEANS)) ** 2
         first = float(weight @ lean / weight.sum()) if step == 0 else first
         shear = float(np.clip(shear - (weight * slope) @ lean / max(weight @ slope**2, 1e-9), -_LARGEST, _LARGEST))
-    # What exceeds the leans of people is the poses' own, as large as it shows itself.
-    own = max(poses.spread.lean**2, first**2 - _BALANCE_STD**2)
-    share, joints = own / (own + _BALANCE_STD**2), poses.joints_px.copy()
+    # What exceeds the leans of people is the poses' own (the estimate of James and Stein).
+    share = max(1.0 - _BALANCE_STD**2 / first**2, 0.0) if first else 0.0
+    joints = poses.joints_px.copy()
     joints[..., 2] += share * shear * shape[..., 1]
     origin = poses.report.origin | {"lean_taken_off_deg": round(float(np.degrees(share * first)), 1)}
     return replace(poses, joints_px=joints, report=replace(poses.report, origin=origin))
