@@ -67,19 +67,19 @@ def balanced(poses: ImagePoses, rotation: np.ndarray, stamp_ns: np.ndarray) -> I
     arm, up = arm[stands], up[stands]
     level = np.array([0.0, 0.0, 1.0]) - up * up[:, 2:]
     level /= np.linalg.norm(level, axis=1, keepdims=True)
-    shear, first = 0.0, 0.0
-    for step in range(_STEPS):
+    shear, leans = 0.0, list[float]()
+    for _ in range(_STEPS):
         leaning = arm + np.outer(arm[:, 1], [0.0, 0.0, shear])
         ahead, high = (leaning * level).sum(axis=1), np.maximum((leaning * up).sum(axis=1), 1e-9)
         lean, slope = ahead / high, arm[:, 1] * (level[:, 2] * high - up[:, 2] * ahead) / high**2
         weight = 1.0 / (1.0 + np.square(lean / _LEANS)) ** 2
-        first = float(weight @ lean / weight.sum()) if step == 0 else first
+        leans.append(float(weight @ lean / weight.sum()))
         shear = float(np.clip(shear - (weight * slope) @ lean / max(weight @ slope**2, 1e-9), -_LARGEST, _LARGEST))
     # What exceeds the leans of people is the poses' own (the estimate of James and Stein).
-    share = max(1.0 - _BALANCE_STD**2 / first**2, 0.0) if first else 0.0
+    share = max(1.0 - _BALANCE_STD**2 / max(leans[0] ** 2, 1e-9), 0.0)
     joints = poses.joints_px.copy()
     joints[..., 2] += share * shear * shape[..., 1]
-    origin = poses.report.origin | {"lean_taken_off_deg": round(float(np.degrees(share * first)), 1)}
+    origin = poses.report.origin | {"lean_taken_off_deg": round(float(np.degrees(share * leans[0])), 1) + 0.0}
     return replace(poses, joints_px=joints, report=replace(poses.report, origin=origin))
 
 

@@ -76,8 +76,8 @@ def test_three_are_followed_each_under_one_number_and_none_has_joints_of_another
         if track_id > 1:  # the subject's estimator does not know of the others
             assert of_another(own, truth, who).any(axis=1).mean() < 0.05
         # Others have two detections, 0.2 s apart, before they are followed; one comes from behind another.
-        # Seen in 35 or 36 of 50 images, by the processor's arithmetic.
-        assert np.isfinite(own).all(axis=2).any(axis=1).mean() > 0.65
+        # 35 of 50 images on one processor, more on another one: the networks' last bits differ.
+        assert np.isfinite(own).all(axis=2).any(axis=1).mean() >= 0.7
     assert owners == {0, 1, 2}
 
 

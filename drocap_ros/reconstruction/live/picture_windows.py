@@ -60,7 +60,7 @@ class PictureWindows:
             self._odometry, self._last = PictureOdometry(), None
         since_ns = max(int(w.stamp_ns[-1]) - self._length_ns, self._odometry.since_ns)
         first = int(np.searchsorted(w.stamp_ns, since_ns))
-        # Nothing tells where the camera is in the images behind the last one with points: later ones may.
+        # The images after the last one with points have no camera yet: a later window may give them one.
         seeing = np.flatnonzero(np.bincount(w.background.frame) >= LEAST_POINTS)
         use = slice(first, seeing[-1] + 1 if len(seeing) else len(w.stamp_ns))
         if use.stop - first < LEAST_VIEWS:
