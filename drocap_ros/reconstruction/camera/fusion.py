@@ -15,7 +15,7 @@ from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.geometry.rotations import exp_so3, hat, log_so3, project_to_so3
 from drocap_ros.reconstruction.camera.causes import contradicted_share, single_causes
-from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
+from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path, rough_path
 from drocap_ros.reconstruction.camera.path_model import (
     ATTITUDE_LATENCY,
     KNOT,
@@ -24,6 +24,7 @@ from drocap_ros.reconstruction.camera.path_model import (
     POSITION_LATENCY,
     PathConfig,
     PathInput,
+    PathState,
 )
 from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
@@ -172,46 +173,46 @@ def _adjusted(data: PathInput) -> AdjustedPath | Refusal | None:
     Errors that are expected to wander far would take the part of a constant yaw.
     """
     given, own = data.path, data.config
-    first = adjust_path(data)
-    if first is None or first.posterior is None:
+    if (state := rough_path(data)) is None:
         return None
-    position_m, attitude_deg = _wander(first, given.fps)
-    tilt_deg = float(np.degrees(np.abs(given.gimbal_axes()[[0, 2]] @ first.shared[MISALIGNMENT])).max())
+    position_m, attitude_deg = _wander(state, given)
+    tilt_deg = float(np.degrees(np.abs(given.gimbal_axes()[[0, 2]] @ state.shared[MISALIGNMENT])).max())
     over = (
         position_m / own.position_wander_m,
         attitude_deg / own.attitude_wander_deg,
         0.5 * tilt_deg / own.tilt_deg,  # two standard deviations of a constant are no exception
     )
-    if max(over) < _OTHER:
-        return _without_latency(data, first)
-    position_m = max(position_m, _WIDE_POSITION_M)
-    wide = replace(
-        own,
-        tilt_deg=max(own.tilt_deg, _WIDE_TILT_DEG),
-        position_wander_m=position_m,
-        # An error that wanders leaves the line between two knots.
-        jitter_m=max(own.jitter_m, position_m * float(np.sqrt(0.5 / KNOTS_HZ / own.position_wander_s))),
-        attitude_wander_deg=max(attitude_deg, _WIDE_ATTITUDE_DEG),
-    )
-    data = replace(data, config=wide)
-    second = adjust_path(data, first.state)
-    if second is None or second.posterior is None:
-        return first
-    left_deg = _wander(second, given.fps)[1]
-    if left_deg > _LARGEST_TURN_DEG and second.covered >= _LEAST_COVERED:
+    if wide := max(over) >= _OTHER:
+        position_m = max(position_m, _WIDE_POSITION_M)
+        own = replace(
+            own,
+            tilt_deg=max(own.tilt_deg, _WIDE_TILT_DEG),
+            position_wander_m=position_m,
+            # An error that wanders leaves the line between two knots.
+            jitter_m=max(own.jitter_m, position_m * float(np.sqrt(0.5 / KNOTS_HZ / own.position_wander_s))),
+            attitude_wander_deg=max(attitude_deg, _WIDE_ATTITUDE_DEG),
+        )
+        data = replace(data, config=own)
+    found = adjust_path(data, state)
+    if found is None or found.posterior is None:
+        return None
+    if not wide:
+        return _without_latency(data, found)
+    left_deg = _wander(found.state, given)[1]
+    if left_deg > _LARGEST_TURN_DEG and found.covered >= _LEAST_COVERED:
         return Refusal(Why.POINTS_TURN_OTHERWISE, left_deg)
-    return _in_its_place(_without_latency(data, second), position_m, given.fps)
+    return _in_its_place(_without_latency(data, found), position_m, given)
 
 
-def _in_its_place(found: AdjustedPath, expected_m: float, fps: float) -> AdjustedPath:
+def _in_its_place(found: AdjustedPath, expected_m: float, given: CameraTelemetry) -> AdjustedPath:
     """The path with a place as uncertain as the wander that was found: points tell nothing of the mean error.
 
     The size of the errors is known by so many independent changes only, so the place has Student's distribution.  What
     stays the same for hours, as a wrong datum, no wander shows.
     """
     assert found.posterior is not None
-    changes = 3.0 * max(len(found.rotation) / fps / _LAG_S, 1.0)
-    wider = max(_wander(found, fps)[0] / expected_m, 1.0) ** 2 * changes / (changes - 2.0)
+    changes = 3.0 * max(given.frames / given.fps / _LAG_S, 1.0)
+    wider = max(_wander(found.state, given)[0] / expected_m, 1.0) ** 2 * changes / (changes - 2.0)
     place, pose = found.posterior.place, found.posterior.pose.copy()
     pose[:, :3, :3] += (wider - 1.0) * place
     return replace(found, posterior=found.posterior._replace(place=wider * place, pose=pose))
@@ -238,10 +239,10 @@ def _without_latency(data: PathInput, found: AdjustedPath) -> AdjustedPath:
     return again
 
 
-def _wander(found: AdjustedPath, fps: float) -> tuple[float, float]:
+def _wander(found: PathState, given: CameraTelemetry) -> tuple[float, float]:
     """Standard deviations (m; degrees) of slow errors that change as the found ones do."""
-    errors = found.state.errors
-    knots_hz = (len(errors) - 1) / max((len(found.rotation) - 1) / fps, 1e-9)
+    errors = found.errors
+    knots_hz = (len(errors) - 1) / max((given.frames - 1) / given.fps, 1e-9)
     lag = max(min(round(_LAG_S * knots_hz), len(errors) // 2), 1)
     change = np.square(errors[lag:] - errors[:-lag]).mean(axis=0) / (2 * (1 - np.exp(-lag / knots_hz / WANDER_S)))
     return float(np.sqrt(change[:3].mean())), float(np.degrees(np.sqrt(change[3:].mean())))
@@ -294,7 +295,7 @@ def _left(config: WorldConfig, steps: np.ndarray) -> WorldConfig:
 
 def _measured(found: AdjustedPath, given: CameraTelemetry) -> dict[str, Any]:
     """JSON-compatible: the telemetry's errors as the points show them, in the terms of a calibration."""
-    axes, shared, wander = given.gimbal_axes(), found.shared, _wander(found, given.fps)
+    axes, shared, wander = given.gimbal_axes(), found.shared, _wander(found.state, given)
     assert found.posterior is not None
     variance = axes @ found.posterior.shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
     return {

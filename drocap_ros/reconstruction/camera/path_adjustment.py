@@ -16,6 +16,8 @@ from drocap_ros.reconstruction.world.findings import Findings
 
 #: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 5e-4
+#: The same of the first steps: after them the errors' wander changes by a twentieth at most.
+_ROUGH = 0.02
 #: Damping of the first step, as a share of the diagonal, and the least one after a step that raises the cost.
 _FIRST_DAMPING = 1e-3
 _LEAST_DAMPING = 1e-6
@@ -64,14 +66,12 @@ class AdjustedPath:
     stop_reason: str
 
 
-def initial_state(data: PathInput, state: PathState | None = None, horizon: float = _HORIZON) -> PathState:
-    """The given path with the points that it triangulates; the other arguments are those of :func:`adjust_path`."""
-    knots, path = data.knots, data.path
-    rest, none = np.zeros((path.frames, KNOT)), np.zeros((len(data.views.track), 4))
-    if state is None:
-        state = PathState(np.zeros((knots.count, KNOT)), rest, np.zeros(SHARED), none, 1.0)
+def initial_state(data: PathInput, horizon: float = _HORIZON) -> PathState:
+    """The given path with the points that it triangulates; ``horizon`` as of :func:`adjust_path`."""
+    path = data.path
     # The unit lets points be about one away, which the triangulation and the points' unknowns presume.
-    unit = max(float(np.linalg.norm(np.ptp(path.position, axis=0))), 1e-9)
+    away = np.linalg.norm(path.position - path.position.mean(axis=0), axis=1)
+    unit = max(float(away.max()), 1e-9)
     for _ in range(2):
         points = triangulate(data.views, path.rotation, path.position / unit, data.matrix)
         away = np.linalg.norm(points[:, :3], axis=1) / np.maximum(np.abs(points[:, 3]), 1e-6)
@@ -84,7 +84,7 @@ def initial_state(data: PathInput, state: PathState | None = None, horizon: floa
         lower = data.views.of_pieces(below) / np.bincount(data.views.piece)
         points[:, 3] = np.clip(horizon + lower, *_NEARNESS)
         points, unit = points / np.linalg.norm(points, axis=1, keepdims=True), 1.0
-    return PathState(state.errors, rest, state.shared, points, unit)
+    return PathState(np.zeros((data.knots.count, KNOT)), np.zeros((path.frames, KNOT)), np.zeros(SHARED), points, unit)
 
 
 def adjust_path(data: PathInput, start: PathState | None = None, horizon: float = _HORIZON) -> AdjustedPath | None:
@@ -92,26 +92,40 @@ def adjust_path(data: PathInput, start: PathState | None = None, horizon: float 
 
     Frames between the knots add little, as errors of tracks last for longer: they have their say in the rest alone.
 
-    start : errors and shared unknowns to start from
+    start : where to start instead of at the given path, the rest of the frames left out
     horizon : tangent of the angle from the image's middle up to the horizon: the first depths of a path without motion
     """
-    at_knots = np.zeros(data.path.frames, bool)
-    at_knots[data.knots.frame] = True
-    views, kept = data.views.at_frames(at_knots)
+    views, kept = _at_knots(data)
     if not len(views.frame):
         return None
-    every, data = replace(data, views=data.views.of(kept)), replace(data, views=views)
-    here, done, stop = improved_path(data, start, horizon)
-    posterior = posterior_of(here)
+    here, done, stop = improved_path(replace(data, views=views), start, horizon)
+    posterior, every = posterior_of(here), replace(data, views=data.views.of(kept))
     final = with_rest(PathResiduals(every, here.weights, here.state, here.usual_outlier()))
     return _solution(final, posterior, done, stop)
 
 
+def rough_path(data: PathInput) -> PathState | None:
+    """The first steps of :func:`adjust_path`: how far the errors wander; None = no track is long enough."""
+    views, _ = _at_knots(data)
+    return improved_path(replace(data, views=views), falls=_ROUGH)[0].state if len(views.frame) else None
+
+
+def _at_knots(data: PathInput) -> tuple[Views, np.ndarray]:
+    """The observations in the frames of the knots, and the pieces (J,) that are still long enough."""
+    keep = np.zeros(data.path.frames, bool)
+    keep[data.knots.frame] = True
+    return data.views.at_frames(keep)
+
+
 def improved_path(
-    data: PathInput, start: PathState | None = None, horizon: float = _HORIZON
+    data: PathInput, start: PathState | None = None, horizon: float = _HORIZON, falls: float = _CONVERGED
 ) -> tuple[PathResiduals, int, str]:
-    """The steps of :func:`adjust_path` alone: where they end, how many there were, and why they ended."""
-    here = PathResiduals(data, weights_of(data), initial_state(data, start, horizon), OUTLIER_SQUARE)
+    """The steps of :func:`adjust_path` alone: where they end, how many there were, and why they ended.
+
+    falls : relative decrease of the cost below which they end
+    """
+    state = initial_state(data, horizon) if start is None else replace(start, rest=np.zeros_like(start.rest))
+    here = PathResiduals(data, weights_of(data), state, OUTLIER_SQUARE)
     stop, done, damping = ITERATIONS, 0, _FIRST_DAMPING
     for _ in range(data.config.iterations):
         done += 1
@@ -121,8 +135,8 @@ def improved_path(
         if there is None:
             stop = NO_DESCENT
             break
-        falls, here = 1.0 - there.cost / here.cost, there
-        if falls <= _CONVERGED and here.outlier >= 0.9 * before:
+        fell, here = 1.0 - there.cost / here.cost, there
+        if fell <= falls and here.outlier >= 0.9 * before:
             stop = CONVERGED
             break
     return here, done, stop
@@ -158,12 +172,9 @@ def with_rest(r: PathResiduals) -> PathResiduals:
     """Residuals after the rest of each frame has been found, with the points where they are."""
     data, config = r.data, r.data.config
     expected = np.repeat([config.jitter_m, np.deg2rad(config.jitter_deg)], 3) ** -2.0
-    frames, (order, place) = data.path.frames, data.views.by_frame
     for _ in range(_REST_STEPS):
-        by_view = np.zeros((frames, int(place.max(initial=0)) + 1, 2, KNOT + 1))
-        by_view[data.views.frame[order], place, :, :KNOT] = r.by_camera[order][..., :KNOT]
-        by_view[data.views.frame[order], place, :, KNOT] = r.weighted[order]
-        rows = by_view.reshape(frames, -1, KNOT + 1)
+        by_view = data.views.of_frames(np.concatenate([r.by_errors, r.weighted[..., None]], axis=2))
+        rows = by_view.reshape(data.path.frames, -1, KNOT + 1)
         own = np.swapaxes(rows, 1, 2) @ rows
         right = own[:, :KNOT, KNOT] + expected * r.state.rest
         step = np.linalg.solve(own[:, :KNOT, :KNOT] + np.diag(expected), -right[..., None])[..., 0]

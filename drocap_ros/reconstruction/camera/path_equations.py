@@ -5,20 +5,19 @@ Gauss-Newton: second derivatives of the residuals are left out, and robust terms
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 from drocap_ros.reconstruction.camera.path_model import KNOT, SHARED
-from drocap_ros.reconstruction.camera.path_residuals import PathResiduals, gradient
+from drocap_ros.reconstruction.camera.path_residuals import PathResiduals, gradient, knots_of_frames
 from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
 
 #: Added to the weight of every point's unknowns, which are about radians: a point without parallax has any depth.  It
 #: also holds the place of a path that nothing else holds, a little.
 POINT_WEIGHT = 10.0
-#: Couplings of the acceleration: two knots on.
-_LEAST_REACH = 3
 
 
 class Step(NamedTuple):
@@ -37,33 +36,25 @@ class PathEquations:
 
     def __init__(self, r: PathResiduals) -> None:
         self._residuals = r
-        views, knots = r.data.views, r.data.knots
-        before = knots.before[views.frame]
-        self._first = before[views.begin] if len(views.track) else np.zeros(0, np.intp)
-        reach = int((before - self._first[views.piece]).max(initial=0)) + 2
-        self._reach = max(min(reach, knots.count), _LEAST_REACH)
+        self._couplings = r.data.couplings
         # Blocks of pieces near the end reach beyond the last knot; those rows are cut.
-        self._rows = KNOT * (knots.count + self._reach)
+        self._rows = KNOT * (r.data.knots.count + self._couplings.reach)
         self._gradient = gradient(r)
         self._set_camera()
         self._add_time()
-        self._eliminate(before)
+        self._eliminate()
 
     def _set_camera(self) -> None:
         """The part of the camera alone, summed over each frame and shared among the knots beside it."""
         r = self._residuals
-        views, knots, frames = r.data.views, r.data.knots, r.data.path.frames
-        camera = r.by_camera
-        order, place = views.by_frame
-        by_view = np.zeros((frames, int(place.max(initial=0)) + 1, 2, camera.shape[2]))
-        by_view[views.frame[order], place] = camera[order]
-        columns = by_view.reshape(frames, -1, camera.shape[2])
+        knots = r.data.knots
+        columns = r.data.views.of_frames(r.by_camera).reshape(r.data.path.frames, -1, r.by_camera.shape[2])
         own = np.swapaxes(columns, 1, 2) @ columns
         self.of_frame = own[:, :KNOT, :KNOT]
         self._free = r.weights.free
         self.corner = r.weights.shared + np.diag((~self._free).astype(float))
         self.corner[np.ix_(self._free, self._free)] += own[:, KNOT:, KNOT:].sum(axis=0)
-        band = np.zeros((self._rows // KNOT, self._reach, KNOT, KNOT))
+        band = np.zeros((self._rows // KNOT, self._couplings.reach, KNOT, KNOT))
         self.border: np.ndarray = np.zeros((self._rows, SHARED))
         at, share = knots.before, knots.share
         for reach, first, weight in (
@@ -72,11 +63,9 @@ class PathEquations:
             (1, at, share * (1.0 - share)),
         ):
             np.add.at(band[:, reach], first, weight[:, None, None] * self.of_frame)
-        by_knot = np.zeros((self._rows // KNOT, KNOT, int(self._free.sum())))
-        np.add.at(by_knot, at, (1.0 - share)[:, None, None] * own[:, :KNOT, KNOT:])
-        np.add.at(by_knot, at + 1, share[:, None, None] * own[:, :KNOT, KNOT:])
-        self.border[:, self._free] = by_knot.reshape(self._rows, -1)
-        width = KNOT * self._reach
+        by_knot = knots_of_frames(r, own[:, :KNOT, KNOT:])
+        self.border[: KNOT * knots.count, self._free] = by_knot.reshape(KNOT * knots.count, -1)
+        width = KNOT * self._couplings.reach
         self.band: np.ndarray = np.zeros((self._rows, width))
         row = np.arange(KNOT)
         for reach in (0, 1):
@@ -100,56 +89,48 @@ class PathEquations:
             band[1 : count - 1, :3, KNOT] -= 2 * swing
             band[: count - 2, :3, 2 * KNOT] += swing
 
-    def _eliminate(self, before: np.ndarray) -> None:
+    def _eliminate(self) -> None:
         """Subtract what the points explain; pieces that begin at one knot have one dense block."""
-        r = self._residuals
-        views, knots = r.data.views, r.data.knots
-        by_point, by_camera = r.by_point, r.by_camera
-        own = by_point[:, 0, :, None] * by_point[:, 0, None] + by_point[:, 1, :, None] * by_point[:, 1, None]
-        both = by_point[:, 0, :, None] * by_camera[:, 0, None] + by_point[:, 1, :, None] * by_camera[:, 1, None]
-        inverse = np.linalg.inv(np.linalg.cholesky(views.of_pieces(own) + POINT_WEIGHT * np.eye(3)))
-        coupling = np.zeros((len(views.track), 3, self._reach, KNOT))
-        relative = before - self._first[views.piece]
-        key = views.piece * self._reach + relative
-        starts = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
-        piece, at = views.piece[starts], relative[starts]
-        knot = both[..., :KNOT]
-        later = knots.share[views.frame][:, None, None] * knot
-        if len(starts) < len(key):
-            knot, later = (np.add.reduceat(of_views, starts, axis=0) for of_views in (knot, later))
-        coupling[piece, :, at] += knot - later
-        coupling[piece, :, at + 1] += later
-        self._inverse = inverse
-        self._knots = inverse @ coupling.reshape(len(views.track), 3, -1)
-        self._shared = inverse @ views.of_pieces(both[..., KNOT:])
-        self._points = np.einsum("jik,jk->ji", inverse, self._gradient[2])
+        r, first, order = self._residuals, self._couplings.first, self._couplings.order
+        views = r.data.views
+        across = np.swapaxes(r.by_point, 1, 2)
+        own = views.of_pieces(across @ r.by_point) + POINT_WEIGHT * np.eye(3)
+        self._inverse = np.linalg.inv(np.linalg.cholesky(own))
+        both = self._inverse[views.piece] @ (across @ r.by_camera)
+        knots = self._couplings.sums @ both[..., :KNOT].reshape(-1, KNOT)
+        self._knots = knots.reshape(len(order), 3, -1)
+        self._shared = views.of_pieces(both[..., KNOT:])[order]
+        self._points = np.einsum("jik,jk->ji", self._inverse, self._gradient[2])[order]
         self.right: np.ndarray = np.zeros(self._rows)
-        self.right[: KNOT * knots.count] = self._gradient[0].reshape(-1)
+        self.right[: self._gradient[0].size] = self._gradient[0].reshape(-1)
+        columns = np.concatenate([self._shared, self._points[..., None], self._knots], axis=2)
         width, item = self.band.shape[1], self.band.itemsize
-        square = np.zeros((width, 2 * width))
+        others = columns.shape[2] - width
+        product = np.zeros((width, others + 2 * width))
         # Element [i, d] is [i, i + d] of the square: the layout of the band.
-        by_distance = as_strided(square, (width, width), ((2 * width + 1) * item, item), writeable=False)
-        order = np.argsort(self._first, kind="stable")
-        groups = np.split(order, np.flatnonzero(np.diff(self._first[order])) + 1)
-        for group in groups:
-            row = KNOT * int(self._first[group[0]])
-            rows = slice(row, row + width)
-            block = self._knots[group].reshape(-1, width)
-            square[:, :width] = block.T @ block
+        strides = (product.strides[0] + item, item)
+        by_distance = as_strided(product[:, others:], (width, width), strides, writeable=False)
+        starts = np.flatnonzero(np.diff(first, prepend=-1)).tolist()
+        for begin, end in pairwise([*starts, len(first)]):
+            rows = slice(KNOT * int(first[begin]), KNOT * int(first[begin]) + width)
+            group = columns[begin:end].reshape(-1, columns.shape[2])
+            product[:, : others + width] = group[:, others:].T @ group
             self.band[rows] -= by_distance
-            self.border[rows, self._free] -= block.T @ self._shared[group].reshape(len(block), self._shared.shape[2])
-            self.right[rows] -= block.T @ self._points[group].reshape(-1)
-        flat = self._shared.reshape(self._points.size, self._shared.shape[2])
-        self.corner[np.ix_(self._free, self._free)] -= flat.T @ flat
+            self.border[rows, self._free] -= product[:, : others - 1]
+            self.right[rows] -= product[:, others - 1]
+        flat = columns[..., :others].reshape(-1, others)
+        shared = flat[:, :-1].T @ flat
+        self.corner[np.ix_(self._free, self._free)] -= shared[:, :-1]
         self.right_shared = self._gradient[1].copy()
-        self.right_shared[self._free] -= flat.T @ self._points.reshape(-1)
-        used = KNOT * knots.count
+        self.right_shared[self._free] -= shared[:, -1]
+        used = self._gradient[0].size
         self.band, self.border, self.right = self.band[:used], self.border[:used], self.right[:used]
 
     def step(self, damping: float = 0.0) -> Step | None:
-        """The step; ``damping`` shortens it, a share of the knots' diagonal; None = not positive definite."""
+        """The step; ``damping`` shortens it, a share of the knots' mean diagonal; None = not positive definite."""
         band = self.band.copy()
-        band[:, 0] *= 1.0 + damping
+        # The mean over the axes does not depend on where north is.
+        band[:, 0] += damping * np.repeat(band[:, 0].reshape(-1, 3).mean(axis=1), 3)
         factor = band_factor(band)
         if factor is None:
             return None
@@ -157,9 +138,12 @@ class PathEquations:
         corner = self.corner - y[:, 1:].T @ y[:, 1:]
         shared = np.linalg.solve(corner, -self.right_shared - y[:, 1:].T @ y[:, 0])
         knots = backward(factor, y[:, :1] - y[:, 1:] @ shared[:, None])[:, 0]
-        reached = np.concatenate([knots, np.zeros(KNOT * self._reach)])
-        near = reached[KNOT * self._first[:, None] + np.arange(self.band.shape[1])]
-        inside = self._points + np.einsum("jik,jk->ji", self._knots, near) + self._shared @ shared[self._free]
+        reached = np.concatenate([knots, np.zeros(KNOT * self._couplings.reach)])
+        near = reached[KNOT * self._couplings.first[:, None] + np.arange(self.band.shape[1])]
+        inside = np.empty_like(self._points)
+        inside[self._couplings.order] = (
+            self._points + np.einsum("jik,jk->ji", self._knots, near) + self._shared @ shared[self._free]
+        )
         points = -np.einsum("jki,jk->ji", self._inverse, inside)
         errors = knots.reshape(-1, KNOT)
         return Step(errors, shared, points)

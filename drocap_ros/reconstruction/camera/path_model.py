@@ -22,6 +22,8 @@ ATTITUDE_LATENCY = 3
 POSITION_LATENCY = 4
 FOCAL = 5
 SHARED = 6
+#: Couplings of the acceleration: two knots on.
+LEAST_REACH = 3
 #: Knots per second: between them a camera that accelerates with 3 m/s^2 leaves a straight line by 6 mm.
 KNOTS_HZ = 8.0
 
@@ -77,6 +79,11 @@ class PathInput:
         """The knots of the path's errors."""
         return Knots(self.path.frames, self.path.fps)
 
+    @cached_property
+    def couplings(self) -> Couplings:
+        """Which knots each piece of a track couples."""
+        return Couplings(self.views, self.knots)
+
 
 class Knots:
     """Knots of time, evenly spaced from the first frame to the last.
@@ -98,6 +105,32 @@ class Knots:
         """Values (K, ...) at the frames."""
         share = self.share.reshape(-1, *(1,) * (values.ndim - 1))
         return np.asarray((1.0 - share) * values[self.before] + share * values[self.before + 1])
+
+
+class Couplings:
+    """The knots beside the views of each piece of a track.
+
+    order : (J,) the pieces by the first of their knots; first : (J,) that knot, in that order
+    reach : most knots from the first one of a piece to its last
+    sums : (3 J reach, 3 N) sparse: rows (N, 3, M) of the views to those (J, reach, M) of the pieces' three unknowns, by
+        the shares of the knots
+    """
+
+    def __init__(self, views: Views, knots: Knots) -> None:
+        from scipy.sparse import csr_array
+
+        before, share, pieces = knots.before[views.frame], knots.share[views.frame], len(views.track)
+        first = before[views.begin] if pieces else np.zeros(0, np.intp)
+        self.order = np.argsort(first, kind="stable")
+        self.first = first[self.order]
+        since = before - first[views.piece]
+        self.reach = max(min(int(since.max(initial=0)) + 2, knots.count), LEAST_REACH)
+        rank = np.empty(pieces, np.intp)
+        rank[self.order] = np.arange(pieces)
+        row = ((3 * rank[views.piece] + np.arange(3)[:, None]) * self.reach + since).T.reshape(-1)
+        column, share = np.arange(len(row)), np.repeat(share, 3)
+        values, at = np.concatenate([1.0 - share, share]), (np.r_[row, row + 1], np.r_[column, column])
+        self.sums = csr_array((values, at), shape=(3 * pieces * self.reach, len(row)))
 
 
 @dataclass(frozen=True)

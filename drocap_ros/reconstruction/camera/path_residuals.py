@@ -184,22 +184,35 @@ class PathResiduals:
         return np.asarray(by_place @ across[:, :3] + towards[..., None] * across[:, 3][:, None])
 
     @cached_property
-    def by_camera(self) -> np.ndarray:
-        """Their derivatives (N, 2, KNOT + U) by a frame's error and the U free shared unknowns."""
-        state, frame, (by_place, slope, per_unit) = self.state, self.data.views.frame, self._by_place
-        free = np.flatnonzero(self.weights.free).tolist()
-        out = np.empty((len(frame), 2, KNOT + len(free)))
+    def _by_turn(self) -> np.ndarray:
+        """Derivatives (N, 2, 3) by a turn of the camera as it stands."""
+        by_place, slope, per_unit = self._by_place
+        out = np.empty(by_place.shape)
         x, y, z = self.seen.T
-        by_turn = np.empty(by_place.shape)
-        by_turn[:, 0, 0], by_turn[:, 1, 0] = -slope[:, 0] * y, -z - slope[:, 1] * y
-        by_turn[:, 0, 1], by_turn[:, 1, 1] = z + slope[:, 0] * x, slope[:, 1] * x
-        by_turn[:, 0, 2], by_turn[:, 1, 2] = -y, x
-        by_turn *= per_unit[..., None]
-        out[..., :3] = by_place * (-state.points[self.data.views.piece, 3] / state.unit)[:, None, None]
-        out[..., 3:KNOT] = by_turn @ left_jacobian(self.turn)[frame]
+        out[:, 0, 0], out[:, 1, 0] = -slope[:, 0] * y, -z - slope[:, 1] * y
+        out[:, 0, 1], out[:, 1, 1] = z + slope[:, 0] * x, slope[:, 1] * x
+        out[:, 0, 2], out[:, 1, 2] = -y, x
+        out *= per_unit[..., None]
+        return out
+
+    @cached_property
+    def by_errors(self) -> np.ndarray:
+        """Derivatives (N, 2, KNOT) by a frame's error."""
+        state, views = self.state, self.data.views
+        out = np.empty((len(views.frame), 2, KNOT))
+        out[..., :3] = self._by_place[0] * (-state.points[views.piece, 3] / state.unit)[:, None, None]
+        out[..., 3:] = self._by_turn @ left_jacobian(self.turn)[views.frame]
+        return out
+
+    @cached_property
+    def by_camera(self) -> np.ndarray:
+        """Derivatives (N, 2, KNOT + U) by a frame's error and the U free shared unknowns."""
+        frame, free = self.data.views.frame, np.flatnonzero(self.weights.free).tolist()
+        out = np.empty((len(frame), 2, KNOT + len(free)))
+        out[..., :KNOT] = self.by_errors
         for column, unknown in enumerate(free, KNOT):
             if unknown == ATTITUDE_LATENCY:
-                out[..., column] = np.einsum("nki,ni->nk", by_turn, self.turn_rate[frame])
+                out[..., column] = np.einsum("nki,ni->nk", self._by_turn, self.turn_rate[frame])
             elif unknown == POSITION_LATENCY:
                 out[..., column] = np.einsum("nki,ni->nk", out[..., :3], self.velocity[frame])
             elif unknown == FOCAL:

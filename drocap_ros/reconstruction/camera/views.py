@@ -43,6 +43,13 @@ class Views:
         """Sums (J, ...) of values (N, ...) over the observations of each piece."""
         return np.asarray(np.add.reduceat(values, self.begin, axis=0))
 
+    def of_frames(self, values: np.ndarray) -> np.ndarray:
+        """Values (N, ...) by frame, (F, M, ...), with zeros where a frame has fewer than the M views of the fullest."""
+        order, place = self.by_frame
+        out = np.zeros((self.frames, int(place.max(initial=0)) + 1, *values.shape[1:]))
+        out[self.frame[order], place] = values[order]
+        return out
+
     def at_frames(self, keep: np.ndarray) -> tuple[Views, np.ndarray]:
         """The observations in frames with ``keep`` (F,), of the pieces (J,) that are still long enough, and these."""
         kept = keep[self.frame]
