@@ -45,6 +45,7 @@ class BackgroundTracks:
 
     def __init__(self) -> None:
         self._grey: np.ndarray | None = None
+        self._small: np.ndarray = np.empty((0, 0), np.uint8)  # the same at half the size
         self._scale = 1.0  # px of the image per px of the grey one
         self._track: np.ndarray = np.empty(0, np.int64)
         self._point: np.ndarray = np.empty((0, 2), np.float32)  # px of the grey image
@@ -60,15 +61,15 @@ class BackgroundTracks:
     def follow(self, image: np.ndarray) -> FixedPoints:
         """Follow the points of the last image into this one (H, W, 3) uint8 BGR; those that it does not show end."""
         grey, scale = _grey(image)
-        last = self._grey
-        if last is None or last.shape != grey.shape:
+        small = _half(grey) if min(grey.shape) > 1 else grey
+        if self._grey is None or self._grey.shape != grey.shape:
             self.reset()
         elif len(self._track):
-            moved, found = _followed(_half(last), _half(grey), _halved(self._point))
+            moved, found = _followed(self._small, small, _halved(self._point))
             self._point = _doubled(moved)
             self._keep(found)
             self._align(grey)
-        self._grey, self._scale = grey, scale
+        self._grey, self._small, self._scale = grey, small, scale
         return self.points
 
     def renew(self, persons: Sequence[np.ndarray], stamp_ns: int) -> FixedPoints:
@@ -80,7 +81,7 @@ class BackgroundTracks:
             self._keep(~((self._point >= box[:2]) & (self._point <= box[2:])).all(axis=1))
         if self._is_due(stamp_ns):
             self._keep(~_crowded(self._point, self._grey.shape))
-            new = _corners(self._grey, wide, self._point)
+            new = _corners(self._small, wide, self._point)
             self._track = np.append(self._track, np.arange(self._next, self._next + len(new)))
             self._point = np.concatenate([self._point, new])
             self._patches += patches_at(self._grey, new)
@@ -189,13 +190,12 @@ def _shift(last: np.ndarray, grey: np.ndarray) -> np.ndarray:
     return way
 
 
-def _corners(grey: np.ndarray, persons: Sequence[np.ndarray], points: np.ndarray) -> np.ndarray:
+def _corners(half: np.ndarray, persons: Sequence[np.ndarray], points: np.ndarray) -> np.ndarray:
     """(N, 2) float32 px, the best corners of the cells of the grid without a point, not more than there is room for.
 
-    Where little of the image has texture, its cells take more than one, then faint corners count.  None lies on
-    persons, boxes (4,) px.
+    half : the image at half the size.  Where little of it has texture, its cells take more than one, then faint corners
+    count.  None lies on persons, boxes (4,) px.
     """
-    half = _half(grey)
     response = cv2.cornerMinEigenVal(half, _BLOCK_PX)
     edge = _EDGE_PX // 2 + 1
     response[:edge], response[-edge:], response[:, :edge], response[:, -edge:] = 0, 0, 0, 0
