@@ -9,6 +9,7 @@ import numpy as np
 from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
 from drocap_ros.reconstruction.camera.fusion import with_camera_errors
+from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ
 from drocap_ros.reconstruction.camera.upright import Upright, set_upright
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
@@ -17,10 +18,11 @@ from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import place_in_world
 from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.reconstruction.world.world_model import WorldConfig
+from drocap_ros.reconstruction.world.world_residuals import WANDER_S
 from drocap_ros.tracks import Tracks
 
 #: Errors of a path from fixed points, per track of which a hundred remain: constant ones have no place in it, as the
-#: points turn with the camera; slow ones are what the adjustment of the path leaves.
+#: points turn with the camera; slow ones are at least these, and what the adjustment of the path leaves.
 _TURNED_DEG = 0.02
 _LATENCY_S = 1e-3
 _POSITION_M = 0.02
@@ -97,13 +99,17 @@ def with_camera(
     world = replace(tracks, camera_rotation=upright.rotation, camera_position=upright.position)
     # What feet have measured the adjustment measures better, from the same feet: no prior counts them twice.
     scale_std = _SCALE_STD if upright.feet_tell else min(upright.scale_std, _SCALE_STD)
+    # Steps of the path err independently and add up to an error that wanders: feet that rest and a body that keeps its
+    # size tell of it.  Errors of its turns go with them, and are the same at the points' distance.
+    step_m = float(np.nan_to_num(_metres_per_unit(camera, upright.position) * camera.position_std))
+    wander_m = step_m * float(np.sqrt(0.5 * KNOTS_HZ * WANDER_S[0]))
     config = replace(
         config,
         stature_std=scale_std if np.isfinite(upright.scale_std) else config.stature_std,
         tilt_error_deg=_TURNED_DEG,
         yaw_error_deg=_TURNED_DEG,
         latency_std_s=_LATENCY_S,
-        position_wander_m=_POSITION_M,
+        position_wander_m=max(_POSITION_M, wander_m),
         attitude_wander_deg=_ATTITUDE_DEG,
         checks=False,
         corrected=True,
@@ -112,12 +118,17 @@ def with_camera(
     return world, PictureWorld(camera, upright, config if sure else None, _errors(camera, upright.position))
 
 
+def _metres_per_unit(camera: PictureCamera, position: np.ndarray) -> float:
+    """Metres per unit of a camera's path, which is known in metres (F, 3) as well."""
+    way_m, way = (float(np.linalg.norm(np.ptp(path, axis=0))) for path in (position, camera.position))
+    return way_m / max(way, 1e-9)
+
+
 def _errors(camera: PictureCamera, position: np.ndarray) -> np.ndarray | None:
     """(F, 6, 6) covariance of a camera's position (m) and rotation (rad), whose path (F, 3) m is known."""
     if camera.drift is None:
         return None
-    way_m, way = (float(np.linalg.norm(np.ptp(path, axis=0))) for path in (position, camera.position))
-    std = camera.drift * [way_m / max(way, 1e-9), 1.0]
+    std = camera.drift * [_metres_per_unit(camera, position), 1.0]
     return np.asarray(np.eye(6) * np.square(np.repeat(std, 3, axis=1))[:, None])
 
 
