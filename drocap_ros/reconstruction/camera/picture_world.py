@@ -22,10 +22,10 @@ from drocap_ros.reconstruction.world.world_residuals import WANDER_S
 from drocap_ros.tracks import Tracks
 
 #: Errors of a path from fixed points, per track of which a hundred remain: constant ones have no place in it, as the
-#: points turn with the camera; slow ones are at least these, and what the adjustment of the path leaves.
+#: points turn with the camera; slow ones (`HELD_M`, `_ATTITUDE_DEG`) are at least these.
 _TURNED_DEG = 0.02
 _LATENCY_S = 1e-3
-_POSITION_M = 0.02
+HELD_M = 0.02
 _ATTITUDE_DEG = 0.05
 #: Deviation (deg) of up below which the lifter sees it and the body is adjusted with it.  Ground under the feet
 #: has 0.5, feet alone 3: with such an up the knees of a still camera's video were bent by 8 degrees more than without.
@@ -109,7 +109,7 @@ def with_camera(
         tilt_error_deg=_TURNED_DEG,
         yaw_error_deg=_TURNED_DEG,
         latency_std_s=_LATENCY_S,
-        position_wander_m=max(_POSITION_M, wander_m),
+        position_wander_m=max(HELD_M, wander_m),
         attitude_wander_deg=_ATTITUDE_DEG,
         checks=False,
         corrected=True,

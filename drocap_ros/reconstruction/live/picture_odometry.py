@@ -25,6 +25,7 @@ from drocap_ros.reconstruction.camera.growth import Grown, Growth, adjusted, tur
 from drocap_ros.reconstruction.camera.kinds import Kind, cut_at, kind_of
 from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ, Knots
 from drocap_ros.reconstruction.camera.picture_world import (
+    HELD_M,
     PictureWorld,
     picture_camera,
     seen_from_camera,
@@ -158,6 +159,8 @@ class PictureOdometry:
         if world.upright.scale_std > _LARGEST_SCALE_STD:
             self._pause("neither feet nor ground give its metres", tracks)
             return None
+        if world.config is not None:  # corrected by each window alone, the path would not be one
+            world = replace(world, config=replace(world.config, position_wander_m=HELD_M))
         self._number, self._retry = self._number + 1, Retry()
         scale = _way(tracks) / max(float(np.linalg.norm(np.ptp(camera.position, axis=0))), 1e-9)
         drift = np.nan_to_num([scale * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)

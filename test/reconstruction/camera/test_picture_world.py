@@ -72,6 +72,18 @@ def test_moving_camera_gives_a_world_that_is_upright_and_has_the_person_at_one_p
     assert "camera that moves" in telemetry_words(motion.meta)
 
 
+def test_feet_and_body_correct_a_path_whose_scale_drifts_as_its_points_allow() -> None:
+    rotation, position = orbit(FRAMES, FPS)
+    shares = np.linspace(1.0, 0.85, FRAMES - 1)[:, None]
+    drifted = np.concatenate([position[:1], position[0] + np.cumsum(shares * np.diff(position, axis=0), axis=0)])
+    scene = seen(rotation, drifted, points_of(np.random.default_rng(5), 100), FPS)
+    noisy = scene.point + np.random.default_rng(3).normal(0.0, 2.0, scene.point.shape)
+    background = Background(scene.frame.astype(np.int32), scene.track.astype(np.int64), noisy.astype(np.float32))
+    motion = reconstruct(replace(tracks(rotation, position), background=background))
+    # Held to the path alone, the person who walks on the spot wanders by 1.3 m.
+    assert np.linalg.norm(np.ptp(motion.joints3d[:, 0], axis=0)) < 0.9
+
+
 def test_camera_that_stands_still_gives_a_world_at_its_place() -> None:
     rotation, position = (np.repeat(values, FRAMES, axis=0) for values in orbit(1, FPS))
     motion = reconstruct(tracks(rotation, position))
