@@ -38,7 +38,7 @@ BUDGETS = {
     # wheels, which came from `cli` (0.07), feet and joints in space by a second network (0.13); steps of an image
     # beside each other (0.10); everybody in one pass: bodies from image to image, whose each joint is (0.75);
     # points of an hour (0.02); persons beside a live subject, each in a place (0.29)
-    ("reconstruction",): 13.70,  # 4.22 over the plan: world/ and live/ kept their steps; one constant a line;
+    ("reconstruction",): 13.69,  # 4.22 over the plan: world/ and live/ kept their steps; one constant a line;
     # with reasons; camera/, paths by fixed points of the scene (1.25), without telemetry, with up and metres (1.20);
     # the view of a camera that looks at the person, assumed lenses, evidence of depth (0.32), in live windows (0.05);
     # one camera for several persons (0.30); live windows by points, their calibration carried on, as a chain (0.30);

@@ -195,7 +195,7 @@ class PathResiduals:
         out *= per_unit[..., None]
         return out
 
-    @cached_property
+    @property
     def by_errors(self) -> np.ndarray:
         """Derivatives (N, 2, KNOT) by a frame's error."""
         state, views = self.state, self.data.views

@@ -99,9 +99,8 @@ def with_camera(
     world = replace(tracks, camera_rotation=upright.rotation, camera_position=upright.position)
     # What feet have measured the adjustment measures better, from the same feet: no prior counts them twice.
     scale_std = _SCALE_STD if upright.feet_tell else min(upright.scale_std, _SCALE_STD)
-    # Steps of the path err independently and add up to an error that wanders: feet that rest and a body that keeps its
-    # size tell of it.  Errors of its turns go with them, and are the same at the points' distance.
-    step_m = float(np.nan_to_num(_metres_per_unit(camera, upright.position) * camera.position_std))
+    # Steps of the path err independently and add up to an error that wanders: resting feet and the body's size tell it.
+    step_m = float(np.nan_to_num(metres_per_unit(camera, upright.position) * camera.position_std))
     wander_m = step_m * float(np.sqrt(0.5 * KNOTS_HZ * WANDER_S[0]))
     config = replace(
         config,
@@ -118,7 +117,7 @@ def with_camera(
     return world, PictureWorld(camera, upright, config if sure else None, _errors(camera, upright.position))
 
 
-def _metres_per_unit(camera: PictureCamera, position: np.ndarray) -> float:
+def metres_per_unit(camera: PictureCamera, position: np.ndarray) -> float:
     """Metres per unit of a camera's path, which is known in metres (F, 3) as well."""
     way_m, way = (float(np.linalg.norm(np.ptp(path, axis=0))) for path in (position, camera.position))
     return way_m / max(way, 1e-9)
@@ -128,7 +127,7 @@ def _errors(camera: PictureCamera, position: np.ndarray) -> np.ndarray | None:
     """(F, 6, 6) covariance of a camera's position (m) and rotation (rad), whose path (F, 3) m is known."""
     if camera.drift is None:
         return None
-    std = camera.drift * [_metres_per_unit(camera, position), 1.0]
+    std = camera.drift * [metres_per_unit(camera, position), 1.0]
     return np.asarray(np.eye(6) * np.square(np.repeat(std, 3, axis=1))[:, None])
 
 

@@ -27,6 +27,7 @@ from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ, Knots
 from drocap_ros.reconstruction.camera.picture_world import (
     HELD_M,
     PictureWorld,
+    metres_per_unit,
     picture_camera,
     seen_from_camera,
     with_camera,
@@ -155,15 +156,16 @@ class PictureOdometry:
             return None
         tracks = replace(tracks, camera_matrix=camera.matrix)
         tracks, world = with_camera(tracks, camera, person.poses, person.metres_per_px(tracks), config)
-        assert world.upright is not None
-        if world.upright.scale_std > _LARGEST_SCALE_STD:
+        upright = world.upright
+        assert upright is not None
+        if upright.scale_std > _LARGEST_SCALE_STD:
             self._pause("neither feet nor ground give its metres", tracks)
             return None
         if world.config is not None:  # corrected by each window alone, the path would not be one
             world = replace(world, config=replace(world.config, position_wander_m=HELD_M))
         self._number, self._retry = self._number + 1, Retry()
-        scale = _way(tracks) / max(float(np.linalg.norm(np.ptp(camera.position, axis=0))), 1e-9)
-        drift = np.nan_to_num([scale * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)
+        unit_m = metres_per_unit(camera, upright.position)
+        drift = np.nan_to_num([unit_m * camera.position_std, np.deg2rad(camera.turn_std_deg)]) * np.sqrt(KNOTS_HZ)
         begun_ns = int(tracks.stamp_ns[0])
         return PicturePath(tracks, world, self._number, begun_ns, float(drift[0]), float(drift[1]), person.subject)
 
@@ -297,10 +299,6 @@ def _corrected(path: PicturePath, grown: tuple[np.ndarray, np.ndarray, np.ndarra
     tracks = replace(tracks, camera_rotation=rotation @ turn.T, camera_position=place)
     world = replace(path.world, upright=upright)
     return replace(path, tracks=tracks, world=world, corrections=path.corrections + 1)
-
-
-def _way(tracks: Tracks) -> float:
-    return float(np.linalg.norm(np.ptp(camera_path(tracks)[1], axis=0)))
 
 
 def own_covariance(path: PicturePath, joints: np.ndarray, stature_std: float) -> np.ndarray:
