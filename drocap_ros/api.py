@@ -46,11 +46,6 @@ def reconstruct(  # noqa: PLR0913 - the options of the command
         "x_min,y_min,x_max,y_max" px in the first image; empty = as configured
     redetect : estimate the 2D poses of a recording from its images, although it holds recorded ones
     progress : called with a stage and its completed share; a negative share = unknown
-
-    Raises
-    ------
-    InputError
-        When an input or option cannot be used, with one line that says what to do.
     """
     settings = config if isinstance(config, DrocapConfig) else load_config(config or None)
     person, rule = parse_subject(str(subject))
@@ -83,11 +78,6 @@ def compare(motion: Motion | str | Path, truth: Motion | str | Path) -> MotionEr
     ----------
     motion : a motion, its file or folder
     truth : a motion, or a file of a motion or of MoCap, or a folder with ``truth.npz`` or ``motion.npz``
-
-    Raises
-    ------
-    InputError
-        When a file cannot be used, or the two do not overlap in time.
     """
     found = motion if isinstance(motion, Motion) else load_motion(motion)
     return comparison.compare(found, *comparison.load_truth(truth))

@@ -33,13 +33,7 @@ class Background:
     point: np.ndarray
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit each other.
-
-        Raises
-        ------
-        InputError
-            When a shape, a type or a value is none of observations.
-        """
+        """Refuse arrays that do not fit each other."""
         rows = len(self.frame) if self.frame.ndim else 0
         expected = {"frame": ((rows,), "iu"), "track": ((rows,), "iu"), "point": ((rows, 2), "f")}
         for name, (shape, kinds) in expected.items():
@@ -58,13 +52,7 @@ class Background:
         return len(self.frame)
 
     def check_frames(self, frames: int) -> None:
-        """Refuse observations in images that a recording of ``frames`` images does not have.
-
-        Raises
-        ------
-        InputError
-            When a frame is outside.
-        """
+        """Refuse observations in images that a recording of ``frames`` images does not have."""
         if len(self) and not (self.frame.min() >= 0 and self.frame.max() < frames):
             raise InputError(
                 f"{ARRAYS['frame']}: expected indices of {frames} images from 0 on, got"
@@ -86,13 +74,7 @@ class Background:
 
 
 def read_background(arrays: Mapping[str, np.ndarray]) -> Background | None:
-    """The observations among the arrays of a tracks file; None = it has none.
-
-    Raises
-    ------
-    InputError
-        When only some of the arrays are there, or they do not fit each other.
-    """
+    """The observations among the arrays of a tracks file; None = it has none."""
     missing = [array for array in ARRAYS.values() if array not in arrays]
     if len(missing) == len(ARRAYS):
         return None

@@ -30,13 +30,7 @@ S = TypeVar("S", bound=Stamped)
 
 @dataclass(frozen=True)
 class Clip:
-    """The images from ``start_s`` to ``end_s``, both included; the default is the whole recording.
-
-    Raises
-    ------
-    InputError
-        When the bounds are not 0 <= start < end.
-    """
+    """The images from ``start_s`` to ``end_s``, both included; the default is the whole recording."""
 
     start_s: float = 0.0
     end_s: float = math.inf
@@ -65,11 +59,6 @@ class Clip:
         """The items, in the order of time, whose stamps lie in the clip; nothing after its end is read.
 
         The items themselves for the whole recording: a stream stays a stream.
-
-        Raises
-        ------
-        InputError
-            When the recording ends before the clip starts.
         """
         return items if self.whole else self._select(items)
 
@@ -88,13 +77,7 @@ class Clip:
             raise self._too_late(last_ns)
 
     def cut(self, tracks: Tracks) -> Tracks:
-        """The frames of tracks whose stamps lie in the clip.
-
-        Raises
-        ------
-        InputError
-            When there is none.
-        """
+        """The frames of tracks whose stamps lie in the clip."""
         if self.whole:
             return tracks
         at_ns = tracks.stamp_ns - tracks.stamp_ns[0]

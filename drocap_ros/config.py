@@ -67,13 +67,7 @@ def section_types() -> dict[str, type[Parameters]]:
 
 
 def load_config(path: str | Path | None) -> DrocapConfig:
-    """Read a configuration file; missing sections and values, and all of them without a file, keep their defaults.
-
-    Raises
-    ------
-    InputError
-        When the file is missing, is not YAML, or has an unknown component or parameter.
-    """
+    """Read a configuration file; missing sections and values, and all of them without a file, keep their defaults."""
     import yaml
 
     if path is None:

@@ -54,13 +54,7 @@ _HEADS = [
 
 
 def file_kind(path: Path) -> FileKind:
-    """Kind of a file.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-    """
+    """Kind of a file."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)

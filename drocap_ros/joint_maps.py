@@ -174,13 +174,7 @@ def joint_set_of(names: Sequence[str]) -> tuple[JointSet, np.ndarray]:
 
 @cache
 def joint_map(skeleton: str) -> JointMap:
-    """Map of a joint set to those joints of the body that it gives.
-
-    Raises
-    ------
-    InputError
-        When there is no table for that set.
-    """
+    """Map of a joint set to those joints of the body that it gives."""
     from drocap_ros.skeleton import joint_set
 
     if skeleton not in TABLES:

@@ -33,13 +33,7 @@ logger = logging.getLogger(__name__)
 
 
 def replay(path: Path, config: DrocapConfig, progress: Progress | None = None) -> tuple[Motion, Tracks]:
-    """Motion and tracks of a recording by the live method, with its own parameters where ``config`` is the default.
-
-    Raises
-    ------
-    InputError
-        When it is no recording, or holds nothing that can be used.
-    """
+    """Motion and tracks of a recording by the live method, with its own parameters where ``config`` is the default."""
     if not path.exists() or not is_recording(path):
         raise InputError(f"{path}: expected a recording with pose2d for method live, found none; use another method")
     with open_session(path) as session:
@@ -87,11 +81,6 @@ def reconstruct_live(
     ``map`` or ``odom`` first, else its initial one.  Where at least half of the frames are there, the motion has these,
     in frame "world"; else all, in frame "camera".  The windows are those that the live graph adjusted where the session
     holds them, else all that are due.  Memory: the poses and one window.
-
-    Raises
-    ------
-    InputError
-        When the session holds no keypoints of a person, or their joints or the size of their images change.
     """
     topic = session.choose_topic(POSE2D)
     published = PublishedPoses(session, topic.name)

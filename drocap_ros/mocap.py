@@ -33,11 +33,6 @@ def load_mocap(
     ----------
     required : joints that the file must hold; others that it lacks are NaN
     joints : ``BODY_15`` or ``BODY_17``, those of the result
-
-    Raises
-    ------
-    InputError
-        When the file cannot be used.
     """
     a = read_npz(path, ("X", "fps", "joints"))
     try:
@@ -68,13 +63,7 @@ def _named_joints(a: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str]]:
 
 
 def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
-    """``.npz`` files of a folder by name; ``include`` is a glob on the name without its ending.
-
-    Raises
-    ------
-    InputError
-        When there is none.
-    """
+    """``.npz`` files of a folder by name; ``include`` is a glob on the name without its ending."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of MoCap .npz files; no such folder")

@@ -106,13 +106,7 @@ _REQUIRED = tuple(spec.name for spec in fields(Motion) if spec.name not in _OPTI
 
 
 def motion_file(path: str | Path, *names: str) -> Path:
-    """The path, or in a folder the first of ``names`` and ``motion.npz`` that exists.
-
-    Raises
-    ------
-    InputError
-        When the folder holds none of them.
-    """
+    """The path, or in a folder the first of ``names`` and ``motion.npz`` that exists."""
     path = Path(path)
     if not path.is_dir():
         return path
@@ -125,13 +119,7 @@ def motion_file(path: str | Path, *names: str) -> Path:
 
 
 def load_motion(path: str | Path) -> Motion:
-    """Read a ``motion.npz``, by its path or that of its folder.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be used.
-    """
+    """Read a ``motion.npz``, by its path or that of its folder."""
     path = motion_file(path)
     a = read_npz(path, _REQUIRED)
     try:

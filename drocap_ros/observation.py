@@ -54,13 +54,7 @@ class PoseObservation:
         return self.track_id > 0
 
     def body_keypoints(self) -> Keypoints2D:
-        """The image's keypoints of ``BODY_17``, float64; toes that the network does not give are NaN.
-
-        Raises
-        ------
-        InputError
-            When the joints are no body set, or an array does not fit them.
-        """
+        """The image's keypoints of ``BODY_17``, float64; toes that the network does not give are NaN."""
         if not body_set(self.joints):
             raise InputError(f"skeleton: expected body15, body17 or body19, got {self.joints.name}; map the joints")
         for name, columns in (("keypoints", (2,)), ("confidence", ()), ("covariance", (3,))):

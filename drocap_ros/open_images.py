@@ -47,11 +47,6 @@ def open_images(source: str | Path, config: ImageIngestConfig | None = None, top
     """Open a video file, image, folder of images, stream or recording; warnings of a recording are logged at the end.
 
     topic : of a recording; empty: that of :func:`drocap_ros.recording.image_messages.choose_images`
-
-    Raises
-    ------
-    InputError
-        When there are no images, with the use of an input of another kind.
     """
     path = Path(source)
     if path.exists():
@@ -89,13 +84,7 @@ def is_blank(image: np.ndarray) -> bool:
 
 
 def refuse_other_inputs(path: Path) -> None:
-    """Refuse the folder of a motion and a telemetry log in the place of images.
-
-    Raises
-    ------
-    InputError
-        When ``path`` is one of them.
-    """
+    """Refuse the folder of a motion and a telemetry log in the place of images."""
     if path.is_dir() and (path / "motion.npz").is_file() and not is_recording(path):
         again = next((path / name for name in ("session", "tracks.npz") if (path / name).exists()), None)
         hint = f"; `drocap reconstruct {again}` repeats it" if again else ""

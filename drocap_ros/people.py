@@ -53,13 +53,7 @@ def track_people(
     progress: Progress | None = None,
     on_frame: Callable[[Frame, list[PoseObservation]], None] | None = None,
 ) -> TrackedPeople:
-    """2D tracks of everybody, or of the selected people, in the selected part of a source's images.
-
-    Raises
-    ------
-    InputError
-        When there are no images, nobody in them, or a number is nobody's.
-    """
+    """2D tracks of everybody, or of the selected people, in the selected part of a source's images."""
     path = Path(path)
     if selection.evidence is not None:
         raise InputError("--evidence: expected one person, found several to reconstruct; choose one with --subject N")
@@ -125,11 +119,6 @@ def reconstruct_everybody(
     """Motions and tracks of everybody in a source's images, or of the selected people, in one world, by their numbers.
 
     The arguments are those of :func:`~drocap_ros.pipeline.reconstruct_input`.
-
-    Raises
-    ------
-    InputError
-        When the input cannot be used.
     """
     path, selection = Path(path), selection or Selection()
     if method == "live":

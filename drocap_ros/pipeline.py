@@ -97,11 +97,6 @@ def reconstruct_input(
         With ``NO_TELEMETRY`` that of a recording or tracks file is not used either; its pitch of a mount is that of a
         recording without the camera's attitude, too
     selection : part of the input; default: all images, the person in most of them
-
-    Raises
-    ------
-    InputError
-        When the input cannot be used.
     """
     if method == "live":
         if selection != _WHOLE:
@@ -153,13 +148,7 @@ def with_origin(motion: Motion, path: Path, origin: Values, seconds: float) -> M
 
 
 def needs_networks(path: Path, redetect: bool) -> bool:
-    """Whether the 2D poses of an input have to be estimated from its images.
-
-    Raises
-    ------
-    InputError
-        When the input does not exist or is of another kind.
-    """
+    """Whether the 2D poses of an input have to be estimated from its images."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
     refuse_other_inputs(path)
@@ -208,13 +197,7 @@ def with_recorded(path: Path, tracks: Tracks, telemetry: Telemetry, selection: S
 
 
 def selected_tracks(tracks: Tracks, telemetry: Telemetry, selection: Selection) -> Tracks:
-    """The part of 2D tracks that is reconstructed, with ``NO_TELEMETRY`` without the camera's pose.
-
-    Raises
-    ------
-    InputError
-        When a log or a person is asked for, or no frame lies in the clip.
-    """
+    """The part of 2D tracks that is reconstructed, with ``NO_TELEMETRY`` without the camera's pose."""
     if selection.person is not None:
         raise InputError(
             f"--subject {selection.person}: expected images, found 2D tracks of one person; leave the option out, or"
@@ -230,13 +213,7 @@ def selected_tracks(tracks: Tracks, telemetry: Telemetry, selection: Selection) 
 def persons_of(
     source: str | Path, config: DrocapConfig, models: Path, selection: Selection, progress: Progress | None
 ) -> list[FoundPerson]:
-    """Persons in the selected part of a source's images, with the numbers that they have in the whole recording.
-
-    Raises
-    ------
-    InputError
-        When a model is missing, or no person is found.
-    """
+    """Persons in the selected part of a source's images, with the numbers that they have in the whole recording."""
     clip, first = selection.clip, list[int]()
     with open_images(source, config.image_ingest, selection.topic) as images:
         meter = clip.meter(progress, "persons", images.duration_s)
@@ -256,13 +233,7 @@ def persons_of(
 def follow_selected(
     source: str | Path, config: DrocapConfig, models: Path, selection: Selection, progress: Progress | None
 ) -> tuple[PoseEstimatorConfig, int | None]:
-    """Parameters of the estimator that follow the selected person, and the stamp (ns) of its first detection, or None.
-
-    Raises
-    ------
-    InputError
-        When there is no such person.
-    """
+    """Parameters of the estimator that follow the selected person; stamp (ns) of its first detection, or None."""
     if selection.person is None:
         return config.pose_estimator, None
     persons = persons_of(source, config, models, selection, progress)

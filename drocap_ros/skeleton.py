@@ -141,13 +141,7 @@ RIGID_BONES = tuple(
 
 
 def joint_set(name: str) -> JointSet:
-    """Joint set by its name.
-
-    Raises
-    ------
-    InputError
-        When there is no set of that name.
-    """
+    """Joint set by its name."""
     try:
         return JOINT_SETS[name]
     except KeyError:
@@ -172,13 +166,7 @@ def side_of(joint: str, joints: tuple[str, ...]) -> str:
 
 
 def indices(joints: tuple[str, ...] | list[str], wanted: tuple[str, ...]) -> np.ndarray:
-    """(len(wanted),) int, indices of the wanted joints in ``joints``.
-
-    Raises
-    ------
-    InputError
-        When a wanted joint is missing.
-    """
+    """(len(wanted),) int, indices of the wanted joints in ``joints``."""
     place = {name: i for i, name in enumerate(joints)}
     missing = [name for name in wanted if name not in place]
     if missing:
@@ -190,11 +178,6 @@ def in_body_order(values: np.ndarray, joints: tuple[str, ...] | list[str], requi
     """Values (F, P, D) of named joints as (F, 17, D) of ``BODY_17``; NaN for a missing joint that is not required.
 
     A missing pelvis is the middle of the hips.
-
-    Raises
-    ------
-    InputError
-        When a required joint is missing.
     """
     indices(joints, required)
     out = np.full((len(values), len(BODY_17), values.shape[2]), np.nan)

@@ -28,13 +28,7 @@ class StampValidator:
         self._others = 0
 
     def check(self, sec: int, nanosec: int) -> None:
-        """Take the next stamp.
-
-        Raises
-        ------
-        InputError
-            When it lies before 1970, is no time, or is far from the others of its stream.
-        """
+        """Take the next stamp."""
         if sec < 0 or nanosec >= NS:
             raise InputError(f"stamp: expected a time after 1970, got {sec} s {nanosec} ns; set the sender's clock")
         stamp_ns = sec * NS + nanosec
@@ -55,13 +49,7 @@ def _far(a_ns: int, b_ns: int) -> bool:
 
 
 def check_stamps(stamp_ns: np.ndarray) -> None:
-    """Refuse stamps (F,) that do not increase, or last longer than a year.
-
-    Raises
-    ------
-    InputError
-        When they do.
-    """
+    """Refuse stamps (F,) that do not increase, or last longer than a year."""
     first, last = int(stamp_ns[0]), int(stamp_ns[-1])
     if last - first > _LONGEST_NS:
         raise InputError(f"stamp_ns: expected nanoseconds within a year, got {first} to {last}; is the unit right?")
@@ -70,13 +58,7 @@ def check_stamps(stamp_ns: np.ndarray) -> None:
 
 
 def as_stamps(array: np.ndarray) -> np.ndarray:
-    """int64 stamps of a file's array.
-
-    Raises
-    ------
-    InputError
-        When it holds no integers, or larger ones.
-    """
+    """int64 stamps of a file's array."""
     if array.dtype.kind not in "iu":
         raise InputError(f"stamp_ns: expected int64 nanoseconds, got {array.dtype}")
     if array.size and array.max() > np.iinfo(np.int64).max:

@@ -31,11 +31,6 @@ def reconstruct_together(
     ----------
     paths : inputs of :func:`reconstruct_input`, two at least; the times of the first one's images are those of all
     telemetry : none, or that which the recordings have with them
-
-    Raises
-    ------
-    InputError
-        When an input cannot be used, or two do not show the same motion.
     """
     solved: list[SolvedView] = []
     read: list[tuple[Path, Values, float]] = []

@@ -148,13 +148,7 @@ def _check_telemetry(t: Tracks) -> None:
 
 
 def check_keypoints(keypoints: np.ndarray, covariance: np.ndarray | None) -> None:
-    """Refuse keypoints (..., 2) px and covariances (..., 3) px^2 that no image has.
-
-    Raises
-    ------
-    InputError
-        When a keypoint is infinite, or a value is far too large.
-    """
+    """Refuse keypoints (..., 2) px and covariances (..., 3) px^2 that no image has."""
     if np.isinf(keypoints).any():
         raise InputError("keypoints: expected finite px or NaN where not seen, got infinity; use NaN")
     for name, unit, values, most in (
@@ -167,13 +161,7 @@ def check_keypoints(keypoints: np.ndarray, covariance: np.ndarray | None) -> Non
 
 
 def check_camera_matrix(matrix: np.ndarray, size: tuple[int, int]) -> None:
-    """Refuse a matrix (3, 3) that is none of a camera with images of ``size`` (width, height) px.
-
-    Raises
-    ------
-    InputError
-        When it is not finite, has another last row, or focal lengths in another unit than px.
-    """
+    """Refuse a matrix (3, 3) that is none of a camera with images of ``size`` (width, height) px."""
     if not np.isfinite(matrix).all() or not np.allclose(matrix[2], (0.0, 0.0, 1.0)):
         raise InputError("camera_matrix: expected finite values and the last row 0 0 1, got others; correct it")
     for i, (axis, length) in enumerate(zip(("width", "height"), size, strict=True)):
@@ -213,13 +201,7 @@ def wrong_kind(path: Path, arrays: Collection[str], expected: str) -> InputError
 
 
 def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Arrays of an ``.npz`` file (never pickles).
-
-    Raises
-    ------
-    InputError
-        When the file is missing, is no ``.npz``, or lacks a required array.
-    """
+    """Arrays of an ``.npz`` file (never pickles)."""
     arrays = _load(path)
     missing = [name for name in required if name not in arrays]
     if missing:
@@ -260,13 +242,7 @@ def _reason(error: Exception) -> str:
 
 
 def load_tracks(path: str | Path) -> Tracks:
-    """Read a tracks ``.npz``; every array is checked and the error names the file.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be used.
-    """
+    """Read a tracks ``.npz``; every array is checked and the error names the file."""
     path = Path(path)
     arrays = read_npz(path, _REQUIRED)
     try:

@@ -22,13 +22,7 @@ def default_folder(source: Path, ending: str) -> Path:
 
 
 def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[str | Path | None], option: str = "--out") -> None:
-    """Validate that no output would replace an input of the command.
-
-    Raises
-    ------
-    InputError
-        When an output is an input.
-    """
+    """Validate that no output would replace an input of the command."""
     there = [path for path in inputs if path is not None]
     for output in outputs:
         if any(is_same(output, path) for path in there):
@@ -41,13 +35,7 @@ def is_same(output: Path, source: str | Path) -> bool:
 
 
 def check_output_folder(target: Path) -> None:
-    """Validate an output folder before the work starts.
-
-    Raises
-    ------
-    InputError
-        When it is a file, or its nearest existing parent is not writable.
-    """
+    """Validate an output folder before the work starts."""
     with _system_errors(target):
         if target.exists() and not target.is_dir():
             raise InputError(f"--out {target}: expected a folder, found a file; choose another name")
@@ -91,13 +79,7 @@ def output_folder(target: Path) -> Iterator[Path]:
 
 
 def check_output_file(target: Path, option: str = "--out") -> None:
-    """Validate an output file before the work starts.
-
-    Raises
-    ------
-    InputError
-        When it is no regular file, or its nearest existing folder is not writable.
-    """
+    """Validate an output file before the work starts."""
     with _system_errors(target, option):
         if target.is_dir():
             raise InputError(f"{option} {target}: expected a file, found a folder; name a file in it")

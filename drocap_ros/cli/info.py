@@ -52,13 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def summarize(path: Path) -> Summary:
-    """Content of a file or folder.
-
-    Raises
-    ------
-    InputError
-        When it is missing, unreadable, or of an unknown kind.
-    """
+    """Content of a file or folder."""
     if not (path.is_file() or path.is_dir()):  # a named pipe would be waited for
         found = "a pipe or device" if path.exists() else "no such file"
         raise InputError(f"{path}: expected a recording, motion or tracks file, found {found}; check the path")

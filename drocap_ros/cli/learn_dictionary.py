@@ -35,13 +35,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Learn and write the dictionary, print its quality.
-
-    Raises
-    ------
-    InputError
-        When an option or the folder is invalid.
-    """
+    """Learn and write the dictionary, print its quality."""
     from drocap_ros.cli.atomic_output import output_file
     from drocap_ros.reconstruction.paper.dictionary import save_dictionary
 

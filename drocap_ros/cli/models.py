@@ -152,11 +152,6 @@ def ensure_networks(folder: Path, source: str | Path, args: argparse.Namespace) 
     """Fetch the default networks into a folder without any, and known ones for feet, which ``--feet`` names.
 
     It needs ``--fetch``, or a yes at the terminal.
-
-    Raises
-    ------
-    InputError
-        When the source has no images, or a network is missing and none is to be fetched.
     """
     from drocap_ros.open_images import open_images
     from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, known_model

@@ -33,13 +33,7 @@ class LineParser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """As of argparse; refuses unknown words, and empty ones: a path of an unset variable is the working directory.
-
-        Raises
-        ------
-        InputError
-            When the words cannot be used.
-        """
+        """As of argparse; refuses unknown words and empty ones: a path of an unset variable is the working directory."""
         words = sys.argv[1:] if args is None else list(args)
         found, unknown = super().parse_known_args(words, namespace)
         if unknown:
@@ -178,13 +172,7 @@ def add_motion_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def read_motion(argument: Path) -> tuple[Path, Motion]:
-    """Path and content of the motion file of MOTION.
-
-    Raises
-    ------
-    InputError
-        When it is not a motion.
-    """
+    """Path and content of the motion file of MOTION."""
     from drocap_ros.motion import load_motion, motion_file
 
     path = motion_file(argument)

@@ -25,13 +25,7 @@ def add_all_option(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def people_of(args: argparse.Namespace) -> tuple[int, ...] | None:
-    """Numbers of ``--subject 1,3``, () of ``--all``; None = one person.
-
-    Raises
-    ------
-    InputError
-        When both are given.
-    """
+    """Numbers of ``--subject 1,3``, () of ``--all``; None = one person."""
     from drocap_ros.perception.tracking.pose_estimator_config import parse_people
 
     if args.all and args.subject:

@@ -40,13 +40,7 @@ def is_video_or_log(path: Path) -> bool:
 
 
 def telemetry_summary(path: Path) -> Summary:
-    """What a video or log holds: rates, shares, lens, and what is missing.
-
-    Raises
-    ------
-    InputError
-        When a log or a video's index cannot be used; damage of the telemetry inside a video is a warning.
-    """
+    """What a video or log holds: rates, shares, lens, and what is missing."""
     from drocap_ros.recording.telemetry.read import LOG_SUFFIXES, read_telemetry
 
     warnings: list[str] = []

@@ -32,13 +32,7 @@ class C3d(NamedTuple):
 
 
 def read_c3d(path: Path) -> C3d:
-    """The points of a file.
-
-    Raises
-    ------
-    InputError
-        When it is damaged, or of a DEC processor; without its name.
-    """
+    """The points of a file."""
     data = path.read_bytes()
     try:
         begin = _BLOCK * (data[0] - 1)

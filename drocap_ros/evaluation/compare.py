@@ -134,11 +134,6 @@ def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]
 
     The file is a MoCap or motion ``.npz``, C3D, TRC or BVH; in a folder ``truth`` with one of these endings, else
     ``motion.npz``.  It has to hold the twelve limb joints; others that it lacks are NaN.
-
-    Raises
-    ------
-    InputError
-        When the file is neither.
     """
     if not isinstance(truth, Motion):
         path = motion_file(truth, *(f"truth{suffix}" for suffix in TRUTH_SUFFIXES))
@@ -161,11 +156,6 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
     Only joints that both have are compared; the twelve limb joints are required.  Times are absolute where both ranges
     overlap; otherwise both start at zero.  The truth is interpolated at the motion's times; frames outside its range,
     or where it has gaps, are left out.
-
-    Raises
-    ------
-    InputError
-        When no finite frame lies within the truth's range, or the truth is not finite.
     """
     estimate = in_body_order(motion.joints3d, motion.joints, LIMB_JOINTS)
     truth = in_body_order(truth, BODY_17.joints[: truth.shape[1]], LIMB_JOINTS)

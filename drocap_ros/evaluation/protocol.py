@@ -52,13 +52,7 @@ class OrbitView:
 def protocol_sequences(
     folder: str | Path, *, shortest_s: float = 5.0, longest_s: float = 10.0, limit: int | None = None
 ) -> list[Sequence]:
-    """Sequences of a MoCap folder as the protocol takes them, by name; with ``BODY_15`` where there are no toes.
-
-    Raises
-    ------
-    InputError
-        When the folder has no usable sequence, or ``limit`` is impossible.
-    """
+    """Sequences of a MoCap folder as the protocol takes them, by name; with ``BODY_15`` where there are no toes."""
     if limit is not None and limit < 1:
         raise InputError(f"--limit: expected at least 1, got {limit}")
     out = []

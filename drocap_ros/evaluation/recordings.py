@@ -46,11 +46,6 @@ def find_recordings(folder: Path) -> list[Recording]:
 
     One is a folder with ``truth.npz`` (or ``.c3d``, ``.trc``, ``.bvh``) and ``tracks.npz``, ``session`` or one other
     input, such as that of ``drocap demo``; or a file ``NAME.mp4`` (``.npz``, ...) beside ``NAME_truth.npz`` (...).
-
-    Raises
-    ------
-    InputError
-        When there is none.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of recordings with truth, found no such folder")
@@ -89,13 +84,7 @@ def recordings_table(
     models: Path | None = None,
     progress: Progress | None = None,
 ) -> list[RecordingRow]:
-    """Every method on every recording, whose 2D poses are estimated once; one that cannot be used is left out.
-
-    Raises
-    ------
-    InputError
-        When none can be used.
-    """
+    """Every method on every recording, whose 2D poses are estimated once; one that cannot be used is left out."""
     rows: list[RecordingRow] = []
     for recording in reported(recordings, len(recordings), "recordings", progress):
         try:

@@ -66,13 +66,7 @@ def rotation_study(
     processes: int = 1,
     progress: Progress | None = None,
 ) -> list[RotationRow]:
-    """Every sequence at every speed by every method, in a fixed order.
-
-    Raises
-    ------
-    InputError
-        When a speed or the number of processes is impossible.
-    """
+    """Every sequence at every speed by every method, in a fixed order."""
     speeds = [float(s) for s in speeds_deg_s]
     for speed in speeds:
         if not abs(speed) <= 360.0:

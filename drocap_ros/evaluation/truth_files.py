@@ -65,13 +65,7 @@ class _Points(NamedTuple):
 
 
 def read_truth_file(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Joints (T, 17, 3) m, z up, NaN unknown, and their times (T,) s; None of a file that is none of these.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be used.
-    """
+    """Joints (T, 17, 3) m, z up, NaN unknown, and their times (T,) s; None of a file that is none of these."""
     try:
         with path.open("rb") as file:
             head = file.read(64).removeprefix(b"\xef\xbb\xbf")

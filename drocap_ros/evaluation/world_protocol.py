@@ -85,11 +85,6 @@ class WorldCase:
     reverse_s : the orbit turns back every so many seconds, first after half of them, within a second; 0 = never
     background : the tracks hold fixed points of the scene
     camera : its number; each flies ``APART_DEG`` ahead of the one before and errs on its own
-
-    Raises
-    ------
-    InputError
-        When the orbit turns back while it still turns.
     """
 
     telemetry: str = "exact"
@@ -129,13 +124,7 @@ class WorldView:
 
 
 def world_sequences(folder: Path, every: int = 1, limit: int | None = None) -> list[tuple[int, Sequence]]:
-    """Every ``every``-th sequence of a MoCap folder, by name, each with its seed: the same for any ``every``.
-
-    Raises
-    ------
-    InputError
-        When the folder has no usable sequence, or a number is impossible.
-    """
+    """Every ``every``-th sequence of a MoCap folder, by name, each with its seed: the same for any ``every``."""
     for name, value in (("every", every), ("limit", limit)):
         if value is not None and value < 1:
             raise InputError(f"--{name}: expected at least 1, got {value}")

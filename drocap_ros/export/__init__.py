@@ -53,12 +53,6 @@ def export(
     -------
     Notes on changes, as sentences: frames without the person, resampling, interpolation, cleaning, constant bones,
     floor, unknown vertical.
-
-    Raises
-    ------
-    InputError
-        When the format or an option is unknown, or the motion has fewer than two frames or lacks data that the format
-        needs.
     """
     from drocap_ros.export import cleaning
     from drocap_ros.export.angles import write_csv_angles

@@ -30,13 +30,7 @@ _CLEAR_DEG = 15.0
 
 
 def write_csv_angles(path: Path, take: Take) -> tuple[str, ...]:
-    """Write a table with the columns ``time_s``, ``frame`` (from 0), and ``NAME_deg`` per joint angle; returns notes.
-
-    Raises
-    ------
-    InputError
-        When a joint of ``BODY_15`` is missing or never known.
-    """
+    """Write a table: ``time_s``, ``frame`` (from 0), and a column ``NAME_deg`` per joint angle; returns notes."""
     take = y_up(take)
     body, notes = body_of(take)
     angles = joint_angles(body, take.rate_hz)

@@ -21,11 +21,6 @@ def write_bvh(path: Path, take: Take, *, names: str = "h36m", rest: str = "t") -
     ----------
     take : z-up; it is resampled to a constant rate, and its gaps are interpolated
     names, rest : as of :func:`~drocap_ros.export.rig.rig_of`
-
-    Raises
-    ------
-    InputError
-        When an option is unknown, a joint of ``BODY_15`` is missing, or a joint is never known.
     """
     take = y_up(at_constant_rate(take))
     rig, notes = rig_of(take, names=names, rest=rest)

@@ -33,11 +33,6 @@ def smooth(take: Take, cut_off_hz: float) -> Take:
     """Take filtered by a zero-phase Butterworth filter of order 4: order 2, both ways (Winter 2009, 3.4.4).
 
     Unknown joints stay unknown; the filter passes over them by linear interpolation.  An uneven time line is resampled.
-
-    Raises
-    ------
-    InputError
-        When the cut-off is not between 0 and half the frame rate, or there are too few frames.
     """
     take = at_constant_rate(take)
     corrected = cut_off_hz / _TWICE
@@ -60,11 +55,6 @@ def lock_feet(take: Take) -> Take:
 
     A foot rests while its ankle is slower than 0.4 m/s for at least 0.2 s; its place is the median over that time.
     Hips stay, thigh and shank keep the frame's lengths, toes move with the ankle.  An uneven time line is resampled.
-
-    Raises
-    ------
-    InputError
-        When the root does not move through the world, or a joint of the legs is missing.
     """
     pelvis = take.positions[:, indices(take.joints, ("pelvis",))[0]]
     pelvis = pelvis[np.isfinite(pelvis).all(axis=1)]

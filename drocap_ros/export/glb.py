@@ -36,11 +36,6 @@ def write_glb(path: Path, take: Take, *, names: str = "h36m", rest: str = "t") -
     Parameters
     ----------
     names, rest : as of :func:`~drocap_ros.export.rig.rig_of`
-
-    Raises
-    ------
-    InputError
-        When an option is unknown, a joint of ``BODY_15`` is missing or never known, or the file would exceed 4 GiB.
     """
     if len(take.positions) * len(BODY) * 16 > _MAX_BYTES:
         raise InputError(f"motion: expected less than 4 GiB of glTF, got {len(take.positions)} frames; cut it")

@@ -22,13 +22,7 @@ _BLOCK = 10_000
 
 
 def write_c3d(path: Path, take: Take) -> tuple[str, ...]:
-    """Write a C3D file of a z-up take; returns notes on changes.
-
-    Raises
-    ------
-    InputError
-        When there are more than 65,535 frames.
-    """
+    """Write a C3D file of a z-up take; returns notes on changes."""
     import c3d
 
     take = at_constant_rate(take)

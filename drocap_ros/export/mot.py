@@ -19,13 +19,7 @@ from drocap_ros.export.take import Take, at_constant_rate, without_gaps, y_up
 
 
 def write_mot(path: Path, take: Take) -> tuple[str, ...]:
-    """Write the coordinates of a z-up take, and beside them the model as ``.osim``; returns notes on changes.
-
-    Raises
-    ------
-    InputError
-        When OpenSim is not installed, a joint of ``BODY_15`` is missing or never known, or OpenSim fails.
-    """
+    """Write the coordinates of a z-up take, and beside them the model as ``.osim``; returns notes on changes."""
     if path.suffix == ".osim":
         raise InputError(f"{path.name}: expected a name for the coordinates, found that of the model; end it in .mot")
     if importlib.util.find_spec("opensim") is None:

@@ -94,11 +94,6 @@ def rig_of(take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tu
     take : y up; gaps are interpolated
     names : one of :data:`NAMES`
     rest : one of :data:`RESTS`
-
-    Raises
-    ------
-    InputError
-        When an option is unknown, a joint of ``BODY_15`` is missing, or a joint is never known.
     """
     for option, value, table in (("names", names, NAMES), ("rest", rest, RESTS)):
         if value not in table:
@@ -113,13 +108,7 @@ def rig_of(take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tu
 
 
 def body_of(take: Take) -> tuple[RigidBody, tuple[str, ...]]:
-    """Rigid body of a take, y up, with its gaps interpolated, and notes on the changes.
-
-    Raises
-    ------
-    InputError
-        When a joint of ``BODY_15`` is missing, or a joint is never known.
-    """
+    """Rigid body of a take, y up, with its gaps interpolated, and notes on the changes."""
     known = np.isfinite(take.positions).all(axis=2)
     take = without_gaps(take)
     body = fit_rigid_body(take.positions, take.joints, known)

@@ -92,11 +92,6 @@ def fit_rigid_body(
     far_m : joints that stay farther from their position gain weight until they are nearer, or for a few rounds
 
     Lengths are those of the frames in which both ends are known.
-
-    Raises
-    ------
-    InputError
-        When a joint of ``BODY_15`` is missing.
     """
     wanted = (*BODY_15.joints, *(TOES if set(TOES) <= set(joints) else ()))
     columns = indices(joints, wanted)

@@ -48,11 +48,6 @@ def take_of(motion: Motion, *, measured: bool = False) -> Take:
 
     Frame "world" keeps its axes (x east, y north, z up).  Frame "camera" (x right, y down, z forward) becomes
     x right, y away from the camera, z up: its vertical is the camera's, not gravity's.
-
-    Raises
-    ------
-    InputError
-        When there are fewer than two frames, no known joint, too many joints, or names that some format refuses.
     """
     _check(motion)
     times = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
@@ -109,11 +104,6 @@ def at_constant_rate(take: Take) -> Take:
 
     An uneven time line is resampled, linearly, at the inverse of its usual step; within gaps longer than
     ``LONGEST_BRIDGE_S`` the result is NaN.
-
-    Raises
-    ------
-    InputError
-        When the even time line would need too many frames.
     """
     times, last = take.times_s, float(take.times_s[-1])
     even_step = last / (len(times) - 1)
@@ -140,13 +130,7 @@ def at_constant_rate(take: Take) -> Take:
 
 
 def without_gaps(take: Take) -> Take:
-    """Take with unknown joints interpolated over time, constant before the first and after the last known one.
-
-    Raises
-    ------
-    InputError
-        When a joint is never known.
-    """
+    """Take with unknown joints interpolated over time, constant before the first and after the last known one."""
     known = np.isfinite(take.positions).all(axis=2)
     never = [name for name, seen in zip(take.joints, known.any(axis=0), strict=True) if not seen]
     if never:

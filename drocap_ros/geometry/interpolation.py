@@ -27,13 +27,7 @@ def usual_step(times: np.ndarray) -> float:
 
 
 def fill_frames(stamp_ns: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Poses (F, P, 3) whose frames of NaN are interpolated in time from their neighbours.
-
-    Raises
-    ------
-    InputError
-        When no frame has a pose.
-    """
+    """Poses (F, P, 3) whose frames of NaN are interpolated in time from their neighbours."""
     known = np.isfinite(joints).all(axis=(1, 2))
     if known.all():
         return joints

@@ -62,11 +62,6 @@ class MavlinkBridgeNode(ComponentNode):
     """One thread owns the link, one steps the control loop, one watches it; the executor takes keypoints.
 
     With a simulated link there are no threads: timers of the node's clock take their place, in a fixed order.
-
-    Raises
-    ------
-    InputError
-        In simulated time with ``commands_enabled`` and without a simulated link: a real autopilot flies in real time.
     """
 
     component = "mavlink_bridge"

@@ -42,13 +42,7 @@ class CameraModel:
 
 
 def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraModel | None:
-    """Camera of a source with images of ``size`` (width, height); None when it is unknown.
-
-    Raises
-    ------
-    InputError
-        When the calibration file cannot be used.
-    """
+    """Camera of a source with images of ``size`` (width, height); None when it is unknown."""
     if config.calibration_file:
         model = load_calibration(Path(config.calibration_file))
         if not model.has_aspect_of(size):
@@ -64,13 +58,7 @@ def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraMode
 
 
 def load_calibration(path: Path) -> CameraModel:
-    """Read the YAML of ROS's ``camera_calibration``.
-
-    Raises
-    ------
-    InputError
-        When the file is missing or lacks a value.
-    """
+    """Read the YAML of ROS's ``camera_calibration``."""
     import yaml
 
     try:

@@ -35,11 +35,6 @@ class Companions:
     ----------
     models_dir, config : as of :class:`~drocap_ros.perception.estimator.PoseEstimator`
     ids : of the persons, each taken once
-
-    Raises
-    ------
-    InputError
-        When a model is missing.
     """
 
     def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig, ids: Iterator[int]) -> None:

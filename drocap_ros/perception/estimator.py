@@ -43,11 +43,6 @@ class PoseEstimator:
     ----------
     models_dir : folder with a person detector and a 2D pose model (``.onnx``)
     config : models, thresholds, choice of the subject
-
-    Raises
-    ------
-    InputError
-        When a model is missing or cannot be used.
     """
 
     def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig | None = None) -> None:

@@ -51,13 +51,7 @@ def limited_use(model: OnnxModel) -> str:
 
 
 def load_detector(models_dir: str | Path, config: PoseEstimatorConfig) -> Detector:
-    """The configured person detector of a folder, or the preferred one with ``auto``.
-
-    Raises
-    ------
-    InputError
-        When the folder has none, or the configured one cannot be used.
-    """
+    """The configured person detector of a folder, or the preferred one with ``auto``."""
     return _load(Path(models_dir), "detector", config.detector, config, Detector)
 
 

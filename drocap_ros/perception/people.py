@@ -85,11 +85,6 @@ class PeopleEstimator:
         """Tracks of everybody over all images, by the numbers of ``drocap track --list``.
 
         Of several numbers of one person, who left and came back, the first one counts.
-
-        Raises
-        ------
-        InputError
-            When no person is found.
         """
         background, nobody = of_images(self._points), [PoseObservation(ns, 0, self._size) for ns in self._stamps]
         found: dict[int, Tracks] = {}

@@ -45,13 +45,7 @@ class FoundPerson:
 
 
 class PersonSearch:
-    """Finds all persons of a stream by five detections a second.
-
-    Raises
-    ------
-    InputError
-        When a model is missing.
-    """
+    """Finds all persons of a stream by five detections a second."""
 
     def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig) -> None:
         # Without a box of the drone the rule `roi` never chooses a subject: all persons are bystanders.
@@ -93,13 +87,7 @@ class PersonFinder(PersonSearch):
         return found
 
     def numbered(self) -> dict[Person, FoundPerson]:
-        """The persons in the order of their appearance, then from left to right.
-
-        Raises
-        ------
-        InputError
-            When no person is found.
-        """
+        """The persons in the order of their appearance, then from left to right."""
         least = min(self._least, self._images)
         found = [(person, boxes) for person, boxes in self._seen.items() if len(boxes) >= least]
         if not found:
@@ -116,13 +104,7 @@ def find_persons(
     config: PoseEstimatorConfig,
     on_frame: Callable[[Frame, None], None] | None = None,
 ) -> list[FoundPerson]:
-    """Persons of a recording, as :class:`PersonFinder` finds them.
-
-    Raises
-    ------
-    InputError
-        When a model is missing, or no person is found.
-    """
+    """Persons of a recording, as :class:`PersonFinder` finds them."""
     finder = PersonFinder(models_dir, config)
     for frame in prefetch(frames):
         if on_frame is not None:
@@ -138,13 +120,7 @@ def in_view(persons: Sequence[Person], stamp_ns: int) -> int:
 
 
 def following(config: PoseEstimatorConfig, persons: Sequence[FoundPerson], number: int) -> PoseEstimatorConfig:
-    """Parameters to follow one of the persons from its first detection on.
-
-    Raises
-    ------
-    InputError
-        When there is no person of that number.
-    """
+    """Parameters to follow one of the persons from its first detection on."""
     person = next((person for person in persons if person.number == number), None)
     if person is None:
         there = f"{persons[0].number} to {persons[-1].number}"

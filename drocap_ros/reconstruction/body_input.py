@@ -17,11 +17,6 @@ def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
     """Keypoints in the order of ``joints``, a body set; those that the tracks lack are NaN.
 
     Names of the body sets, COCO, COCO-WholeBody, Halpe, MPII and Human3.6M are known (:mod:`drocap_ros.joint_maps`).
-
-    Raises
-    ------
-    InputError
-        When the names give too few joints of BODY_15.
     """
     source, place = joint_set_of(tracks.joints)
     have = place >= 0

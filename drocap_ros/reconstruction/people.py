@@ -31,11 +31,6 @@ def reconstruct_people(
     to the last image that shows them.
 
     people : tracks of the same images by number, with the same camera and fixed points
-
-    Raises
-    ------
-    InputError
-        When the method is unknown or of a person too few joints are seen.
     """
     seen = {number: np.flatnonzero(np.isfinite(tracks.keypoints).any(axis=(1, 2))) for number, tracks in people.items()}
     first = max(people, key=lambda number: (len(seen[number]), -number))

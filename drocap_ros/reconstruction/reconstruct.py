@@ -98,11 +98,6 @@ def reconstruct(
         In frame "world" when the tracks hold the camera's rotation, else in frame "camera"; with the joints of the
         method, ``BODY_17`` or ``BODY_15``, and by the default method with the heels where the tracks hold them.
         Where fixed points show cuts, each shot has a camera of its own; without one for each, frame "camera" it is.
-
-    Raises
-    ------
-    InputError
-        When the method is unknown or too few joints are seen.
     """
 
     def of(clip: Tracks, progress: Progress | None) -> Motion:

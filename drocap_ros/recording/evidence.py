@@ -39,11 +39,6 @@ def with_evidence(tracks: Tracks, path: Path) -> Tracks:
 
     ``joints3d`` is another name of the latter; ``evidence_sigma`` (N, J) is its expected error in the same unit.  The
     N images are those of the tracks, or ``stamp_ns`` (N) says which.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be used, or belongs to other images.
     """
     arrays = read_npz(path, ("joints",))
     name = next((name for name in _ARRAYS if name in arrays), None)

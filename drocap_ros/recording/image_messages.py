@@ -31,11 +31,6 @@ def image_from_message(message: Message, compressed: bool | None = None) -> np.n
     """(H, W, 3) uint8 BGR of an image or compressed image of ROS or Foxglove.
 
     compressed : None = by the fields of the message
-
-    Raises
-    ------
-    InputError
-        When the encoding is unknown or the data does not fit.
     """
     data = np.ascontiguousarray(np.frombuffer(bytes(message.data), np.uint8))
     if hasattr(message, "format") if compressed is None else compressed:
@@ -45,13 +40,7 @@ def image_from_message(message: Message, compressed: bool | None = None) -> np.n
 
 
 def choose_images(session: Session, wanted: str = "") -> TopicInfo:
-    """The topic of a name, else that of colour images with most messages, else of grey ones; depth is passed over.
-
-    Raises
-    ------
-    InputError
-        When there is none.
-    """
+    """The topic of a name, else that of colour images with most messages, else of grey ones; depth is passed over."""
     found = session.topics_of(*IMAGES)
     names = ", ".join(topic.name for topic in found)
     if wanted:
@@ -84,11 +73,6 @@ def read_images(session: Session, topic: str = "") -> Iterator[Frame]:
 
     Images that do not decode, or with a stamp not later than the previous one or far from it, are left out with a
     warning.  Where the stamps of the messages do not advance, the times at which they were recorded are taken.
-
-    Raises
-    ------
-    InputError
-        When there are no images, or none decodes.
     """
     from drocap_ros.perception.sources.base import Frame
 

@@ -25,13 +25,7 @@ def is_recording(path: str | Path) -> bool:
 
 
 def open_session(path: str | Path) -> Session:
-    """Open a recording.
-
-    Raises
-    ------
-    InputError
-        When it is missing, of another kind, or unreadable.
-    """
+    """Open a recording."""
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: expected {FORMS}, found no such file; check the path")
@@ -49,13 +43,7 @@ def open_session(path: str | Path) -> Session:
 
 
 def session_info(path: str | Path) -> SessionInfo:
-    """Topics, types, counts, time and metadata of a recording.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-    """
+    """Topics, types, counts, time and metadata of a recording."""
     with open_session(path) as session:
         return session.info
 

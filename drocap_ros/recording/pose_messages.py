@@ -22,14 +22,7 @@ if TYPE_CHECKING:
 
 
 def observation_from_message(message: Message) -> PoseObservation:
-    """Message -> observation; its arrays stay float32, as they were sent.
-
-    Raises
-    ------
-    InputError
-        When the skeleton is unknown, an array has the wrong length, a value is infinite or impossible, or the stamp
-        is negative.
-    """
+    """Message -> observation; its arrays stay float32, as they were sent."""
     joints = joint_set(message.skeleton)
     count = len(joints) if message.track_id else 0
     stamp_ns = header_stamp_ns(message)
@@ -59,13 +52,7 @@ def observation_from_message(message: Message) -> PoseObservation:
 
 
 def fixed_points_from_message(message: Message) -> FixedPoints:
-    """``BackgroundTracks`` -> the scene's fixed points.
-
-    Raises
-    ------
-    InputError
-        When the arrays do not fit each other, a value is not finite, or a number is there twice.
-    """
+    """``BackgroundTracks`` -> the scene's fixed points."""
     track = np.array(message.track, np.int64)
     point = float_array(message.point, (len(track), 2), "point")
     if not np.isfinite(point).all():
@@ -99,13 +86,7 @@ def add_state(history: CameraHistory, message: Message) -> None:
 
 
 def add_calibration(history: CameraHistory, message: Message) -> None:
-    """Give a camera's history a ``CameraInfo``; an uncalibrated one changes nothing.
-
-    Raises
-    ------
-    InputError
-        When the calibration is not one in px.
-    """
+    """Give a camera's history a ``CameraInfo``; an uncalibrated one changes nothing."""
     matrix = calibration_of(message)
     if matrix is not None:
         size = (message.width, message.height)
@@ -115,13 +96,7 @@ def add_calibration(history: CameraHistory, message: Message) -> None:
 
 
 def float_array(values: Sequence[float] | np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Flat ``float32[]`` of a message -> array of a shape.
-
-    Raises
-    ------
-    InputError
-        When the length does not fit or a value is infinite.
-    """
+    """Flat ``float32[]`` of a message -> array of a shape."""
     wanted = int(np.prod(shape))
     if len(values) != wanted:
         raise InputError(f"{name}: expected {wanted} values for shape {shape}, got {len(values)}")

@@ -120,13 +120,7 @@ class Session(ABC):
         return sorted(found, key=lambda topic: (topic.of_another, -topic.count, topic.name))
 
     def choose_topic(self, *type_names: str) -> TopicInfo:
-        """The topic of some types with most messages.
-
-        Raises
-        ------
-        InputError
-            When there is none.
-        """
+        """The topic of some types with most messages."""
         found = self.topics_of(*type_names)
         kinds = " or ".join(type_names)
         if not found:

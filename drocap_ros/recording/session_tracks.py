@@ -37,11 +37,6 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
     ----------
     mount_pitch_deg : of a camera fixed to the body, negative down, for recordings without the camera's attitude
     telemetry : whether the states of the vehicle are used
-
-    Raises
-    ------
-    InputError
-        When there are no usable keypoints, or ``mount_pitch_deg`` contradicts the recording.
     """
     chosen = session.choose_topic(recorded.POSE2D)
     poses: dict[int, Message] = {}
@@ -85,13 +80,7 @@ def _of_one_clock(session: Session, stamps: Iterable[int]) -> list[int]:
 def with_recorded_camera(
     session: Session, tracks: Tracks, near: str, mount_pitch_deg: float | None = None, *, telemetry: bool = True
 ) -> Tracks:
-    """Tracks with the camera's matrix and poses where the recording holds them, those nearest to a topic's name.
-
-    Raises
-    ------
-    InputError
-        When ``mount_pitch_deg`` contradicts the recording.
-    """
+    """Tracks with the camera's matrix and poses where the recording holds them, those nearest to a topic's name."""
     tracks = dataclasses.replace(tracks, camera_matrix=_camera_matrix(session, near, tracks.image_size))
     if not telemetry:
         return tracks

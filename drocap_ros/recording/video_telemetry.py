@@ -47,13 +47,7 @@ class Telemetry:
 
 
 def with_attitude(tracks: Tracks, attitude_deg: tuple[float, float] | None) -> Tracks:
-    """Tracks of a camera that stands still, with its rotation by pitch and roll (deg); it looks north.
-
-    Raises
-    ------
-    InputError
-        When the rotation is known already.
-    """
+    """Tracks of a camera that stands still, with its rotation by pitch and roll (deg); it looks north."""
     if attitude_deg is None:
         return tracks
     if tracks.camera_rotation is not None:
@@ -79,11 +73,6 @@ def read_video_telemetry(video: Path, telemetry: Telemetry) -> tuple[Path, Telem
     """The named log of a video, else the first of :func:`own_telemetry` that can be used; None where there is none.
 
     Own telemetry that cannot be true is warned of and not used.
-
-    Raises
-    ------
-    InputError
-        When the named log cannot be used, or the input is no video.
     """
     if telemetry.path == NO_TELEMETRY:
         return None
@@ -121,11 +110,6 @@ def with_telemetry(
     """Tracks of a video with the camera of its telemetry, and the sources by name; warns of what is missing or assumed.
 
     The camera matrix comes from the configuration, else from the lens that the log describes.
-
-    Raises
-    ------
-    InputError
-        When the time offset is unknown or the calibration cannot be used.
     """
     (name, log), pitch = found, telemetry.mount_pitch_deg
     offset = find_offset(video, log, telemetry.time_offset_s, pitch, progress)

@@ -18,11 +18,6 @@ def flexion(joints: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]
     ----------
     joints : (F, P, 3), any unit and frame
     names : (P,) of the joints
-
-    Raises
-    ------
-    InputError
-        When a joint is missing.
     """
     at = dict(zip(names, np.moveaxis(joints, 1, 0), strict=True))
     indices(names, ("neck", "pelvis", *(side + name for side in "rl" for name in ("hip", *sum(_CHAINS.values(), ())))))

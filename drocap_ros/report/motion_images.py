@@ -148,11 +148,6 @@ def read_motion_images(path: Path, motion: Shown, progress: Progress | None = No
     """Images of a motion out of its video, folder or recording.
 
     Frames are matched by their stamps; without a common clock both start with their first frame.
-
-    Raises
-    ------
-    InputError
-        When there are no images, or none at the motion's times.
     """
     encode, follow = _Encoder(), FollowingBox()
     found: list[tuple[int, bytes, Box]] = []
@@ -175,13 +170,7 @@ def _wanted(length: int) -> list[int]:
 
 
 def each_image(path: Path, motion: Shown) -> Iterator[tuple[int, np.ndarray]]:
-    """Index and image (H, W, 3) uint8 BGR of every frame that has one; matched as in :func:`read_motion_images`.
-
-    Raises
-    ------
-    InputError
-        When there are no images, or none at the motion's times.
-    """
+    """Index and image (H, W, 3) uint8 BGR of every frame that has one; matched as in :func:`read_motion_images`."""
     found = False
     with _opened(path, motion) as source:
         for index, image in _matched(source, motion, range(len(motion.stamp_ns))):

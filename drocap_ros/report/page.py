@@ -43,11 +43,6 @@ def save_report(
     former : report whose images are kept, where there are no others and it shows the same keypoints; it may be missing
     command : command line of the report, shown beside the one in the motion's ``meta``
     progress : called with the stage "report" and its completed share
-
-    Raises
-    ------
-    InputError
-        When the motion holds no pose or lacks the joints of a torso, or the video cannot be used.
     """
     if video is not None:
         images = read_motion_images(video, motion, progress)

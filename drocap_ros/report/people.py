@@ -95,13 +95,7 @@ def save_people_report(
     command: str = "",
     progress: Progress | None = None,
 ) -> None:
-    """Write one report of several persons; as :func:`~drocap_ros.report.page.save_report`.
-
-    Raises
-    ------
-    InputError
-        When the video cannot be used.
-    """
+    """Write one report of several persons; as :func:`~drocap_ros.report.page.save_report`."""
     from drocap_ros.report.motion_images import read_motion_images
     from drocap_ros.report.page import render_report
 

@@ -85,13 +85,7 @@ class Statistics:
 
 
 def motion_statistics(motion: Motion) -> Statistics:
-    """Statistics of a motion.
-
-    Raises
-    ------
-    InputError
-        When the joints that define a torso are missing, or no joint is known in any frame.
-    """
+    """Statistics of a motion."""
     indices(motion.joints, _TORSO)
     if not np.isfinite(motion.joints3d).all(axis=2).any():
         raise InputError(

@@ -222,13 +222,7 @@ def views_to_ros(views: ViewForecastData, stamp_ns: int) -> ViewForecast:
 
 
 def views_from_ros(message: ViewForecast) -> ViewForecastData:
-    """Message -> forecast of the views.
-
-    Raises
-    ------
-    InputError
-        When the views are no whole grid, or a value is impossible.
-    """
+    """Message -> forecast of the views."""
     count, names = len(message.error_m), ("bearing_deg", "elevation_deg", "error_m")
     bearing, elevation, error = (float_array(getattr(message, name), (count,), name).astype(float) for name in names)
     grid = len(np.unique(bearing)) * len(np.unique(elevation))
@@ -247,13 +241,7 @@ def camera_transform(window: AdjustedWindow, child: str) -> TransformStamped:
 
 
 def pose3d_from_ros(message: Pose3D) -> tuple[np.ndarray, np.ndarray]:
-    """Message -> joints (P, 3) m and confidence (P,), both float64, in the message's own frame.
-
-    Raises
-    ------
-    InputError
-        When the skeleton is unknown or an array has the wrong length or is infinite.
-    """
+    """Message -> joints (P, 3) m and confidence (P,), both float64, in the message's own frame."""
     count = len(joint_set(message.skeleton)) if message.track_id else 0
     joints = float_array(message.joints, (count, 3), "joints").astype(np.float64)
     return joints, float_array(message.confidence, (count,), "confidence").astype(np.float64)

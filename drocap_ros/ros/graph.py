@@ -159,11 +159,6 @@ class Graph:
 
         It finds its peers by itself; :meth:`wait_ready` waits for that.  A recorder continues in a new folder beside
         the session's, so that the recording so far stays as it is.
-
-        Raises
-        ------
-        InputError
-            When no such node was started here.
         """
         index = next((i for i, runner in enumerate(self._runners) if runner.name == name), None)
         if index is None or self._start is None:

@@ -21,13 +21,7 @@ _SIGMAS = 2.0
 
 
 def pose_markers(message: Pose3D, lifetime_s: float) -> MarkerArray:
-    """Skeleton, joints and their uncertainty ellipsoids of one pose, in the pose's frame, for ``lifetime_s``.
-
-    Raises
-    ------
-    InputError
-        When the pose's arrays do not fit.
-    """
+    """Skeleton, joints and their uncertainty ellipsoids of one pose, in the pose's frame, for ``lifetime_s``."""
     joints, _ = pose3d_from_ros(message)
     if not len(joints):
         return MarkerArray()
@@ -81,11 +75,6 @@ def keypoint_marker(message: Pose2D) -> ImageMarker:
     """Bones and a cross on each keypoint, drawn over the image; without a subject the previous marker is removed.
 
     One marker of lines, not one per joint: viewers keep only the last message of a topic of image markers.
-
-    Raises
-    ------
-    InputError
-        When the message's arrays do not fit.
     """
     observation = pose2d_from_ros(message)
     marker = ImageMarker(header=message.header, ns="keypoints", type=ImageMarker.LINE_LIST, action=ImageMarker.ADD)

@@ -64,11 +64,6 @@ def human_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformS
     """Frame ``body_<id>`` between the hips, x forward, z up along the trunk, and one per link of :data:`LINKS` in it.
 
     The links have the axes of the body: joints alone do not determine the rotation of a limb about itself.
-
-    Raises
-    ------
-    InputError
-        When the pose's arrays do not fit.
     """
     joints, _ = pose3d_from_ros(message)
     joints_of = joint_set(message.skeleton) if message.track_id else None
@@ -126,13 +121,7 @@ class HumanTopics:
         self._tracked: dict[str, tuple[str, Publisher, Publisher, Publisher]] = {}
 
     def publish(self, topic: str, message: Pose2D) -> None:
-        """Publish a body's box and keypoints, and the identifiers of all.
-
-        Raises
-        ------
-        InputError
-            When the message's arrays do not fit.
-        """
+        """Publish a body's box and keypoints, and the identifiers of all."""
         observation = pose2d_from_ros(message)
         now = body_id(message.track_id, self._prefix) if observation.has_subject else ""
         before, *old = self._tracked.get(topic, ("",))

@@ -50,11 +50,6 @@ def simulate_capture(
     seed : person, take and noise
     start_ns : stamp of the first image
     joint_set : ``BODY_15`` or ``BODY_17``
-
-    Raises
-    ------
-    InputError
-        When length or rate is out of range.
     """
     config = config or SimulationConfig()
     if not (np.isfinite(fps) and 0 < fps <= 1000):

@@ -85,11 +85,6 @@ def simulate_person(
     Returns
     -------
     (F, P, 3) m, order of ``joint_set``, world ENU.
-
-    Raises
-    ------
-    InputError
-        When the action is unknown, or the times are negative, not finite or beyond 10 h.
     """
     if action not in ACTIONS:
         raise InputError(f"action: expected one of {', '.join(ACTIONS)}, got {action!r}")

@@ -281,11 +281,6 @@ def draw_session(
     ----------
     namespace : of the topics; None = that with most keypoints, poses and images
     progress : called with a name and the share done
-
-    Raises
-    ------
-    InputError
-        When the recording holds nothing to draw.
     """
     counts = {topic.name: topic.count for topic in session.info.topics if topic.count}
     space = _busiest_namespace(counts) if namespace is None else f"/{namespace.strip('/')}".rstrip("/")

@@ -29,13 +29,7 @@ INSTALL = "pip install 'rerun-sdk>=0.39,<0.40'"
 
 
 def new_recording(name: str) -> rerun.RecordingStream:
-    """An empty named recording.
-
-    Raises
-    ------
-    InputError
-        When Rerun is not installed.
-    """
+    """An empty named recording."""
     recording: rerun.RecordingStream = _rerun().RecordingStream("drocap", recording_id=name)
     recording.set_log_tick_enabled(False)
     recording.set_log_time_enabled(False)
@@ -53,13 +47,7 @@ def to_file(recording: rerun.RecordingStream, path: Path, layout: rrb.Blueprint)
 
 
 def to_window(recording: rerun.RecordingStream, layout: rrb.Blueprint, memory_limit: str) -> None:
-    """Send the recording to the desktop viewer, started if necessary.
-
-    Raises
-    ------
-    InputError
-        When the viewer does not start.
-    """
+    """Send the recording to the desktop viewer, started if necessary."""
     try:
         recording.spawn(memory_limit=memory_limit, default_blueprint=layout)
     except RuntimeError as error:
@@ -85,11 +73,6 @@ def to_browser(
     ----------
     host : address to serve on; 127.0.0.1 = this machine alone
     newest_first : a page that is opened late starts with the newest data
-
-    Raises
-    ------
-    InputError
-        When a port is in use, or the address is not this machine's.
     """
     _check_free(host, port, port + 1)
     command = [_program(), "--serve-web", "--bind", host, "--port", str(port + 1)]

@@ -28,11 +28,6 @@ def read_inputs(words: Iterable[str], defaults: argparse.Namespace) -> list[argp
     ----------
     words : lists (``.txt``), folders, glob patterns and recordings
     defaults : options of ``reconstruct``; a line of a list may change them
-
-    Raises
-    ------
-    InputError
-        When a word leads to no recording, or a list cannot be read.
     """
     found: list[argparse.Namespace] = []
     for word in words:

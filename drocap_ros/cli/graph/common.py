@@ -40,13 +40,7 @@ def add_start_options(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_domain(args: argparse.Namespace) -> int:
-    """The domain that the option or the environment names, else 0.
-
-    Raises
-    ------
-    InputError
-        When it is no number from 0 to 101.
-    """
+    """The domain that the option or the environment names, else 0."""
     name, value = "--domain-id", args.domain_id
     if value is None:  # an empty variable counts as none, as in ROS
         name, value = _VARIABLE, os.environ.get(_VARIABLE, "").strip() or "0"

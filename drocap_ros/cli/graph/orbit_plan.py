@@ -40,13 +40,7 @@ class _Flight(NamedTuple):
 
 
 def preview(session: Path, out: Path, config: MavlinkBridgeConfig) -> str:
-    """Draw the picture; returns a line about it.
-
-    Raises
-    ------
-    InputError
-        When the session has no refined poses in ``map``, or too few.
-    """
+    """Draw the picture; returns a line about it."""
     from drocap_ros.cli.atomic_output import check_output_file, output_file
 
     check_output_file(out)

@@ -47,11 +47,6 @@ class MavlinkLink:
     clock_ns : our clock, ns; that of the stamps
     monotonic_s : clock of the periods and of silence
     transport : instead of that of ``config.url``
-
-    Raises
-    ------
-    InputError
-        At construction, when the URL or the file of the signing key cannot be used.
     """
 
     def __init__(

@@ -54,12 +54,7 @@ mavlink.mavlink_map.setdefault(CurrentMode.id, CurrentMode)  # a later pymavlink
 
 
 def read_signing_key(path: str) -> bytes:
-    """32 bytes from a file of 64 hexadecimal digits.  Error messages never contain the content of the file.
-
-    Raises
-    ------
-    InputError
-    """
+    """32 bytes from a file of 64 hexadecimal digits.  Error messages never contain the content of the file."""
     file = Path(path).expanduser()
     remedy = "write one by `openssl rand -hex 32`, and give the autopilot the same"
     try:

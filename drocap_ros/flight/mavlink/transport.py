@@ -54,13 +54,7 @@ class Transport(Protocol):
 
 
 def open_transport(url: str) -> Transport:
-    """Open the transport that a URL names: one of ``URL_FORMS``, also with ``//`` after the colon.
-
-    Raises
-    ------
-    InputError
-        When the URL cannot be understood, or its address, port or device cannot be used.
-    """
+    """Open the transport that a URL names: one of ``URL_FORMS``, also with ``//`` after the colon."""
     last_s = time.monotonic() + _HELD_S
     while True:
         try:

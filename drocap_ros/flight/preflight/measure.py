@@ -97,11 +97,6 @@ class Listening:
     ----------
     seconds : since the first message of the autopilot; without one, since the beginning
     keywords : of :class:`MavlinkLink`
-
-    Raises
-    ------
-    InputError
-        At construction, when the link cannot be opened.
     """
 
     def __init__(

@@ -139,13 +139,7 @@ class Framing:
         self._margin = math.nan
 
     def calibrate(self, matrix: np.ndarray) -> Condition | None:
-        """Take a camera matrix (3, 3) px; returns a condition where it is that of another camera or zoom.
-
-        Raises
-        ------
-        InputError
-            When a value is not finite or a focal length is not positive.
-        """
+        """Take a camera matrix (3, 3) px; returns a condition where it is that of another camera or zoom."""
         if not np.isfinite(matrix).all() or np.any(np.diag(matrix)[:2] <= 0):
             raise InputError("camera_info: expected a camera matrix with positive focal lengths; calibrate the camera")
         self.matrix, before = np.asarray(matrix, dtype=float), self._judged_by

@@ -58,11 +58,6 @@ def write_blazepose(tflite: Path, target: Path) -> None:
     Parameters
     ----------
     tflite : MediaPipe's ``pose_detection.tflite`` or ``pose_landmark_full.tflite`` (or lite, heavy)
-
-    Raises
-    ------
-    InputError
-        When the file is no such network.
     """
     import onnx
     from onnx import helper, numpy_helper

@@ -35,11 +35,6 @@ class OnnxModel:
     path : the ``.onnx`` file
     threads : intra-op threads on the CPU
     provider : "auto" or a key of the execution providers
-
-    Raises
-    ------
-    InputError
-        When onnxruntime cannot run the file or does not offer the provider.
     """
 
     def __init__(self, path: Path, threads: int = 1, provider: str = "auto") -> None:
@@ -93,13 +88,7 @@ class OnnxModel:
         self._session = self._open(str(self.path))
 
     def __call__(self, tensor: np.ndarray) -> list[np.ndarray]:
-        """Outputs, in order, for one input tensor.
-
-        Raises
-        ------
-        InputError
-            When the model refuses the input or returns a value that is not finite.
-        """
+        """Outputs, in order, for one input tensor."""
         try:
             outputs = self._session.run(self._names, {self.inputs[0].name: tensor.astype(self._dtype, copy=False)})
         except Exception as error:  # noqa: BLE001  # onnxruntime's exceptions have no common base
@@ -142,13 +131,7 @@ def with_dynamic_size(path: Path) -> bytes | None:
 
 
 def choose_providers(wanted: str, offered: list[str]) -> list[str]:
-    """Execution providers in order of use, always ending with the CPU.
-
-    Raises
-    ------
-    InputError
-        When the wanted provider is not offered by the installed onnxruntime.
-    """
+    """Execution providers in order of use, always ending with the CPU."""
     if wanted == "auto":
         return [_PROVIDERS[key] for key in _AUTO_ORDER if _PROVIDERS[key] in offered]
     name = _PROVIDERS.get(wanted, wanted)

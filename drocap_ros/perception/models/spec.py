@@ -137,13 +137,7 @@ class ModelSpec:
 
 
 def read_spec(model: OnnxModel) -> ModelSpec:
-    """Spec of a model from one trial run and the YAML beside it.
-
-    Raises
-    ------
-    InputError
-        When the outputs fit no known layout, or the YAML is invalid.
-    """
+    """Spec of a model from one trial run and the YAML beside it."""
     path = model.path.with_suffix(".yaml")
     given = _read_yaml(path)
     size, channels_last = _input_size(model, given)

@@ -276,11 +276,6 @@ def as_onnx(path: Path) -> tuple[onnx.GraphProto, list[str]]:
     """Graph of a network with one image as its input, and the names of its outputs in the file's order.
 
     The input ``image`` is (1, 3, H, W) float32; outputs of rows keep their shape.
-
-    Raises
-    ------
-    InputError
-        When the file is no such network, or has other operators.
     """
     from onnx import TensorProto, helper
 

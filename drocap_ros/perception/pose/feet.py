@@ -18,13 +18,7 @@ _SAME_ANKLE = 0.1
 
 
 class FeetModel:
-    """A pose network that serves for the feet alone.
-
-    Raises
-    ------
-    InputError
-        When it gives no toes and heels.
-    """
+    """A pose network that serves for the feet alone."""
 
     def __init__(self, model: PoseModel) -> None:
         self._body = BodyPoseModel(model)

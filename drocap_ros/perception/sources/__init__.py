@@ -26,11 +26,6 @@ def open_source(uri: str | Path, config: ImageIngestConfig | None = None) -> Ima
     ----------
     uri : path or URL; ``file://`` is allowed
     config : rates, camera mode and time-outs; ``config.source`` is ignored
-
-    Raises
-    ------
-    InputError
-        When the source cannot be opened.
     """
     config, text = config or ImageIngestConfig(), str(uri)
     if camera := _CAMERA.match(text):

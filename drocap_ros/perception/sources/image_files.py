@@ -19,13 +19,7 @@ _STAMP_DIGITS = 16
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 BGR, with its EXIF orientation applied.
-
-    Raises
-    ------
-    InputError
-        When the file is missing or not an image.
-    """
+    """(H, W, 3) uint8 BGR, with its EXIF orientation applied."""
     import cv2
 
     if not path.is_file():
@@ -62,11 +56,6 @@ class ImageFileSource(ImageSource):
     """Image files of one size.
 
     Stamps are the file names where these are times in nanoseconds, else ``rate_hz`` counts from 0.
-
-    Raises
-    ------
-    InputError
-        When there is no image, or one is unreadable or of another size.
     """
 
     def __init__(self, path: Path, rate_hz: float = 30.0) -> None:

@@ -82,11 +82,6 @@ class LiveSource(ImageSource):
     name : in messages
     connect : opens an OpenCV capture, or raises InputError
     config : stall time-out and longest reconnection pause
-
-    Raises
-    ------
-    InputError
-        When the first connection fails or gives no image.
     """
 
     live = True

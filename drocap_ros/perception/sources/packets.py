@@ -31,11 +31,6 @@ def decoded_packets(codec: str, packets: Iterable[tuple[int, bytes]]) -> Iterato
     """Stamps and images of packets with their stamps; those before the first key frame are left out.
 
     FFmpeg reads them as a file, which is written first: a decoder may order them anew.
-
-    Raises
-    ------
-    InputError
-        When the codec is unknown, or nothing decodes.
     """
     found = next(((code, key) for name, code, key in _CODECS if name.search(codec)), None)
     if found is None:

@@ -73,13 +73,7 @@ def _eight_bits(image: np.ndarray) -> np.ndarray:
 
 
 def decoded(data: np.ndarray, form: str) -> np.ndarray:
-    """(H, W, 3) uint8 BGR of a JPEG, PNG or other image in memory; ``form`` is its stated format.
-
-    Raises
-    ------
-    InputError
-        When it does not decode.
-    """
+    """(H, W, 3) uint8 BGR of a JPEG, PNG or other image in memory; ``form`` is its stated format."""
     import cv2
 
     if data[:2].tobytes() == b"\xff\xd8" and b"\xff\xd9" not in data[-_JPEG_TAIL:].tobytes():
@@ -104,11 +98,6 @@ def raw_to_bgr(data: np.ndarray, size: tuple[int, int], step: int, encoding: str
     step : bytes per row
     encoding : as ROS names them, also planar YUV
     big_endian : order of the bytes of a sample
-
-    Raises
-    ------
-    InputError
-        When the encoding is unknown or the data does not fit.
     """
     import cv2
 

@@ -75,11 +75,6 @@ class VideoSource(ImageSource):
     A stamp is the frame's presentation time in its container, from 0 at the first; variable frame rates keep
     their times.  Rotation metadata is applied.  A file that is cut off gives its frames up to the cut and an
     ``ENDED_EARLY`` event.
-
-    Raises
-    ------
-    InputError
-        When the file is missing or no video, or its index or first frame cannot be decoded.
     """
 
     def __init__(self, path: Path) -> None:

@@ -40,11 +40,6 @@ class Lifter:
 
         quick : its twin ``NAME_quick.onnx``, where there is one: by products of integers, in less than half of the
             time; a joint of a newest frame comes to lie 2 mm aside
-
-        Raises
-        ------
-        InputError
-            When the file is no such network.
         """
         file = Path(path or SHIPPED)
         if not file.is_file():
@@ -79,13 +74,7 @@ class Lifter:
         return fps / self.network.fps
 
     def lift(self, seen: LifterInput, fps: float | None = None) -> LiftedMotion:
-        """Lift a sequence of evenly spaced frames at 1 to 1000 frames per second.
-
-        Raises
-        ------
-        InputError
-            On other shapes, or when no joint is ever seen.
-        """
+        """Lift a sequence of evenly spaced frames at 1 to 1000 frames per second."""
         pace = self._pace(fps)
         seen = _checked(seen)
         if pace > self.network.fastest:

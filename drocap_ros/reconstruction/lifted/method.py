@@ -36,13 +36,7 @@ from drocap_ros.reconstruction.lifted.window_solver import Cancelled, solve_sign
 
 
 def prepare(config: LiftedConfig) -> None:
-    """Load libraries and network before the first window.
-
-    Raises
-    ------
-    InputError
-        When ``config.lifter`` is no lifter.
-    """
+    """Load libraries and network before the first window."""
     import_libraries()
     Lifter.load(config.lifter or None)
 
@@ -127,11 +121,6 @@ def solve_even_window(  # noqa: PLR0913 - what is known of camera, body and dept
     cancelled : called before every step of the adjustments but the first; True ends them
     rotation : (F, 3, 3) world (z up) -> camera, NaN where unknown; None = unknown
     evidence : poses of these frames by another method, BODY_17 in camera axes; None = there are none
-
-    Raises
-    ------
-    InputError
-        When no joint is ever seen.
     """
     config = config or LiftedConfig()
     lifter = Lifter.load(config.lifter or None)

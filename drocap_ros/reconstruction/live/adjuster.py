@@ -59,11 +59,6 @@ class LiveAdjuster:
         effort : limits of the work; None = no limit beyond the configuration
         cancelled : as of :func:`~drocap_ros.reconstruction.lifted.method.solve_even_window`; the result's
             ``effort`` holds the steps taken and repeats the result
-
-        Raises
-        ------
-        InputError
-            When the window shows no person; the known sizes stay.
         """
         effort = effort or Effort()
         part = window.every(effort.stride)

@@ -47,13 +47,7 @@ class LiveInitializer:
         self.event = StreamEvent.FIRST
 
     def push(self, observation: PoseObservation) -> InitialPose | None:
-        """Pose of the next image, or None when ``event`` drops it.
-
-        Raises
-        ------
-        InputError
-            When an array has a wrong shape or an impossible value.
-        """
+        """Pose of the next image, or None when ``event`` drops it."""
         keypoints = _keypoints(observation)
         self.event = self._order.classify(observation.stamp_ns, observation.track_id, observation.image_size)
         if self.event.dropped:

@@ -43,13 +43,7 @@ class Method:
 
     @cached_property
     def run(self) -> Callable[[MethodInput], ImagePoses]:
-        """The function that gives the poses.
-
-        Raises
-        ------
-        InputError
-            When an installed package does not have it.
-        """
+        """The function that gives the poses."""
         module, _, name = self.place.partition(":")
         try:
             function: Callable[[MethodInput], ImagePoses] = getattr(import_module(module, __name__), name)

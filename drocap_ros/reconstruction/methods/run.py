@@ -15,13 +15,7 @@ from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS, normalize_trac
 
 
 def run_method(name: str, data: MethodInput) -> ImagePoses:
-    """Poses of all frames by one of :data:`~drocap_ros.reconstruction.methods.METHODS`.
-
-    Raises
-    ------
-    InputError
-        When the keypoints show no person, or the method of another package gives something else than their poses.
-    """
+    """Poses of all frames by one of :data:`~drocap_ros.reconstruction.methods.METHODS`."""
     normalize_tracks(data.keypoints)  # raises on input without a usable frame
     use = usable_frames(data.keypoints)
     if use.all():

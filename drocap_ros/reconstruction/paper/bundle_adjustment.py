@@ -130,11 +130,6 @@ def bundle_adjust(
     information : (F, P, 3) of :func:`~drocap_ros.reconstruction.paper.reprojection.information_from`, 0 where not seen
     s0 : (F, P, 3) initial poses in camera axes (x right, y down, z forward), in the unit of w
     config : weights of the terms and limits of the solver
-
-    Raises
-    ------
-    InputError
-        When the shapes do not fit or the initial poses are not finite.
     """
     config = config or BundleAdjusterConfig()
     if w.ndim != 3 or w.shape[2] != 2:

@@ -131,11 +131,6 @@ def learn(
     ----------
     poses : (N, 15, 3) of :func:`normalize_poses`; their mirror images are added
     progress : called with the fraction done
-
-    Raises
-    ------
-    InputError
-        When there are fewer poses than atoms.
     """
     atoms, sparsity, batch = how.atoms, how.sparsity, how.batch
     if len(poses) < atoms:
@@ -225,13 +220,7 @@ def save_dictionary(path: str | Path, dictionary: Dictionary) -> None:
 
 
 def load_dictionary(path: str | Path | None = None) -> Dictionary:
-    """Read a dictionary; None reads the shipped one.
-
-    Raises
-    ------
-    InputError
-        When the file is no dictionary of BODY_15.
-    """
+    """Read a dictionary; None reads the shipped one."""
     path = SHIPPED if path is None else Path(path)
     a = read_npz(path, _ARRAYS)
     joints = tuple(str(j) for j in a["joints"])

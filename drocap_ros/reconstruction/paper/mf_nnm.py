@@ -45,11 +45,6 @@ def factorize(
     Returns
     -------
     poses (F, P, 3) in camera axes, cost per term, iterations, stop reason
-
-    Raises
-    ------
-    InputError
-        When there are too few images: two orthographic ones fix no rotation.
     """
     if len(w) < MIN_IMAGES:
         raise InputError(

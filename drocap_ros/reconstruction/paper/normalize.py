@@ -44,11 +44,6 @@ def normalize_tracks(keypoints: Keypoints2D) -> NormalizedTracks:
     Parameters
     ----------
     keypoints : px; confidences of NaN and 0 count as not seen; covariances of seen joints must be positive definite
-
-    Raises
-    ------
-    InputError
-        When no image shows enough joints, or the joints of every image coincide, or a covariance is impossible.
     """
     weights = keypoints.seen.astype(np.float64)
     if keypoints.confidence is not None:
@@ -76,13 +71,7 @@ def normalize_tracks(keypoints: Keypoints2D) -> NormalizedTracks:
 
 
 def check_uncertainty(keypoints: Keypoints2D, seen: np.ndarray) -> None:
-    """Check confidence and covariance as :func:`normalize_tracks` does; ``seen`` (F, P) bool.
-
-    Raises
-    ------
-    InputError
-        When a confidence is out of range or the covariance of a seen joint is not positive definite.
-    """
+    """Check confidence and covariance as :func:`normalize_tracks` does; ``seen`` (F, P) bool."""
     if keypoints.confidence is not None:
         _checked_confidence(keypoints.confidence)
     if keypoints.covariance is not None:

@@ -40,11 +40,6 @@ def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> 
     list
         The common body as each recording's camera sees it, at the first one's images on its own clock, in the order of
         the recordings; the first one's motion has all of its frames.  ``meta["together"]`` has times and places.
-
-    Raises
-    ------
-    InputError
-        When two recordings do not show the same motion at any time.
     """
     views = [View.of(one, name) for one, name in zip(solved, names, strict=True)]
     home = _home(views)

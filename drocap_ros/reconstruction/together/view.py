@@ -61,13 +61,7 @@ class View:
 
     @staticmethod
     def of(solved: SolvedView, name: str) -> View:
-        """The view of a recording that was solved alone.
-
-        Raises
-        ------
-        InputError
-            When nothing is known of its lens.
-        """
+        """The view of a recording that was solved alone."""
         if solved.tracks.camera_matrix is None:
             raise InputError(
                 f"{name}: expected a known lens, found none; add camera_matrix to the tracks, or the video"

@@ -78,11 +78,6 @@ def read_keypoints(path: Path, rate_hz: float | None = None, size: tuple[int, in
 
     Without ``rate_hz`` and ``size`` (width, height) px these are the file's; else 30 and a person in the middle.  Where
     the size is known, a network's file is of pictures of a lens.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be used.
     """
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):

@@ -43,14 +43,7 @@ class RecoveredFile:
 
 
 def recover_session(path: str | Path, progress: Progress | None = None) -> list[RecoveredFile]:
-    """Repair a session folder or a single ``.mcap`` in place.
-
-    Raises
-    ------
-    InputError
-        When it is no MCAP session, nothing of it can be read, or there is no space for the copy; then nothing has
-        changed.
-    """
+    """Repair a session folder or a single ``.mcap`` in place."""
     path = Path(path)
     files, custom = _files(path)
     done = []

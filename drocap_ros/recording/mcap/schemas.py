@@ -55,13 +55,7 @@ def standard_types() -> Typestore:
 
 @lru_cache(maxsize=256)
 def schema_text(type_name: str) -> str:
-    """Definition of a message type (``package/msg/Name``) with those of all types in it.
-
-    Raises
-    ------
-    InputError
-        When the type is unknown.
-    """
+    """Definition of a message type (``package/msg/Name``) with those of all types in it."""
     try:
         text, _ = standard_types().generate_msgdef(type_name, ros_version=2)
     except Exception as error:  # noqa: BLE001  # rosbags passes on any error of its types

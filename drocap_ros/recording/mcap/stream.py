@@ -125,13 +125,7 @@ class McapStream:
     _metadata: dict[str, dict[str, str]] = field(default_factory=dict)
 
     def messages(self) -> Iterator[McapMessage]:
-        """All messages in the order of the file.
-
-        Raises
-        ------
-        InputError
-            When the file is no MCAP or cannot be opened.
-        """
+        """All messages in the order of the file."""
         from mcap.records import Channel, Header, Message, Metadata, Schema
 
         schemas: dict[int, Schema] = {}

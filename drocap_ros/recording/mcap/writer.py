@@ -39,11 +39,6 @@ class SessionWriter:
     folder : to create; it must not exist, or be empty
     config : chunks, files, queue, free space
     metadata : configuration, versions, model hashes and the like
-
-    Raises
-    ------
-    InputError
-        When the folder is not empty, cannot be created, or the disk is full.
     """
 
     def __init__(
@@ -115,11 +110,6 @@ class SessionWriter:
         type_name : ``package/msg/Name``
         schema : its definition with all dependencies, see :func:`drocap_ros.recording.mcap.schemas.schema_text`
         image : whether its messages may be dropped before others
-
-        Raises
-        ------
-        InputError
-            When the topic is registered with another type.
         """
         with self._lock:
             known = self._topics.get(topic)
@@ -138,13 +128,7 @@ class SessionWriter:
             self._description_changed = True
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> bool:
-        """Queue one serialized (CDR) message; False when it was dropped.
-
-        Raises
-        ------
-        InputError
-            When the topic was not registered.
-        """
+        """Queue one serialized (CDR) message; False when it was dropped."""
         if topic not in self._topics:
             raise InputError(f"{topic}: expected a registered topic; call register first")
         published_ns = log_time_ns if publish_time_ns is None else publish_time_ns

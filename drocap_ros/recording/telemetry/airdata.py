@@ -50,13 +50,7 @@ _COLUMNS: dict[str, tuple[str, _Units]] = {
 
 
 def read_airdata(path: Path) -> TelemetryLog:
-    """Gimbal, aircraft and position by time since the start of the log, and the parts that are on video (isVideo).
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, lacks the columns, or cannot be true.
-    """
+    """Gimbal, aircraft and position by time since the start of the log, and the parts that are on video (isVideo)."""
     try:
         table = _Table(path)
     except (csv.Error, UnicodeError) as error:

@@ -39,11 +39,6 @@ def read_dataflash(path: Path) -> TelemetryLog:
     """Attitude (ATT), position (POS) and mount (MNT) by time since power-up; UTC from the GPS.
 
     The angles of servos (``MNT1_TYPE`` is 1) are against the body, those of other mounts against horizon and north.
-
-    Raises
-    ------
-    InputError
-        When the file is no DataFlash log or holds no attitude.
     """
     content, lacks = _Content(), []
     try:

@@ -136,13 +136,7 @@ def make_log(
     position: np.ndarray | None = None,
     gimbal: np.ndarray | None = None,
 ) -> TelemetryLog:
-    """Log from its series (N, ...) at ``stamp_ns``; states are sorted, missing series are NaN and listed as lacks.
-
-    Raises
-    ------
-    InputError
-        When there is neither an attitude nor a position.
-    """
+    """Log from its series (N, ...) at ``stamp_ns``; states are sorted, missing series are NaN and listed as lacks."""
     count = len(stamp_ns)
     order = np.argsort(stamp_ns, kind="stable")
     stamps = np.asarray(stamp_ns, np.int64)[order]

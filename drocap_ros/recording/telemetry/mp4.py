@@ -69,13 +69,7 @@ def read_tracks(file: IO[bytes]) -> list[Track]:
 
 
 def read_samples(file: IO[bytes], track: Track) -> Samples:
-    """Places and times of a track's samples; samples beyond the file's end are left out.
-
-    Raises
-    ------
-    InputError
-        When a table is missing or contradicts the file's size; the text lacks the file's name.
-    """
+    """Places and times of a track's samples; samples beyond the file's end are left out."""
     boxes = {box.name: box for box in _children(file, track.table)}
     length = file.seek(0, 2)
     sizes = _sizes(file, boxes.get(b"stsz"), length)

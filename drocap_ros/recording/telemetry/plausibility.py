@@ -48,13 +48,7 @@ class Series(NamedTuple):
 
 
 def plausible(path: Path, series: Series) -> tuple[Series, list[LogLack]]:
-    """The series without damaged states and places without a fix, and what was left out.
-
-    Raises
-    ------
-    InputError
-        When the content cannot be true.
-    """
+    """The series without damaged states and places without a fix, and what was left out."""
     lacks: list[LogLack] = []
     gimbal, aircraft, place = (series[i].copy() for i in (1, 2, 3))
     place[(place[:, :2] == 0).all(axis=1)] = np.nan  # no fix

@@ -15,13 +15,7 @@ LOG_SUFFIXES = tuple(f.suffix for f in FORMATS if f.suffix)
 
 
 def read_telemetry(path: str | Path) -> TelemetryLog:
-    """Read a log; the first bytes select the format, else the suffix.
-
-    Raises
-    ------
-    InputError
-        When the file is missing, of an unknown format, or holds no attitude and no position.
-    """
+    """Read a log; the first bytes select the format, else the suffix."""
     path = Path(path)
     try:
         with path.open("rb") as file:

@@ -63,13 +63,7 @@ _UNKNOWN = (math.nan, math.nan, math.nan)
 
 
 def read_srt(path: Path) -> TelemetryLog:
-    """Gimbal attitude and position of every subtitle, by the video's own clock.
-
-    Raises
-    ------
-    InputError
-        When the file holds no telemetry.
-    """
+    """Gimbal attitude and position of every subtitle, by the video's own clock."""
     entries = _entries(path)
     stamps, places, kinds, gimbal, body, lens, clock_s = map(np.array, zip(*entries, strict=True))
     heights = next((kind for kind in _HEIGHTS if kind in kinds), "height")

@@ -80,13 +80,7 @@ def find_offset(
     mount_pitch_deg: float | None = None,
     progress: Progress | None = None,
 ) -> TimeOffset:
-    """The offset of a video and a log; see the module's text.
-
-    Raises
-    ------
-    InputError
-        When it is not given and cannot be estimated.
-    """
+    """The offset of a video and a log; see the module's text."""
     if given_s is not None:
         return TimeOffset(given_s, OffsetSource.GIVEN)
     if log.video_clock:

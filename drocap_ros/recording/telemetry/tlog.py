@@ -27,13 +27,7 @@ _CHUNK = 1 << 20
 
 
 def read_tlog(path: Path) -> TelemetryLog:
-    """Attitude, position and gimbal of the first autopilot in the log, by the ground station's clock.
-
-    Raises
-    ------
-    InputError
-        When the file is no tlog or holds no attitude.
-    """
+    """Attitude, position and gimbal of the first autopilot in the log, by the ground station's clock."""
     from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 
     estimator, rows = VehicleStateEstimator(), []
@@ -52,13 +46,7 @@ def read_tlog(path: Path) -> TelemetryLog:
 
 
 def tlog_messages(path: Path) -> Iterator[tuple[MAVLink_message, int]]:
-    """Messages of a log with their times of reception, ns; damaged parts are skipped.
-
-    Raises
-    ------
-    InputError
-        When the file holds no MAVLink message.
-    """
+    """Messages of a log with their times of reception, ns; damaged parts are skipped."""
     from drocap_ros.flight.mavlink.parser import MavlinkParser
 
     parser, found = MavlinkParser(), False

@@ -38,13 +38,7 @@ _YAW_IN_EARTH = 64  # bit
 
 
 def read_ulog(path: Path) -> TelemetryLog:
-    """Attitude (``vehicle_attitude``), position and gimbal by time since power-up; UTC from the GPS.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, is no ULog, or holds no attitude.
-    """
+    """Attitude (``vehicle_attitude``), position and gimbal by time since power-up; UTC from the GPS."""
     from pyulog import ULog
 
     try:

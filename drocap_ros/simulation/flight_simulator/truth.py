@@ -72,13 +72,7 @@ def save_flight_truth(path: Path, truth: FlightTruth) -> None:
 
 
 def load_flight_truth(path: Path) -> FlightTruth:
-    """Read a file of :func:`save_flight_truth`.
-
-    Raises
-    ------
-    InputError
-        When the file is no such truth.
-    """
+    """Read a file of :func:`save_flight_truth`."""
     motion = load_motion(path)
     more = read_npz(path, ("camera_position", "camera_matrix", "image_size"))
     frames = len(motion.stamp_ns)
@@ -113,13 +107,7 @@ class OrbitQuality(NamedTuple):
 
 
 def orbit_quality(truth: FlightTruth, within: np.ndarray, radius_m: float) -> OrbitQuality:
-    """Quality of the orbit over the exposures ``within`` (F,) bool; angles and speeds from pairs of neighbours.
-
-    Raises
-    ------
-    InputError
-        When ``within`` has fewer than two exposures.
-    """
+    """Quality of the orbit over the exposures ``within`` (F,) bool; angles and speeds from pairs of neighbours."""
     if int(within.sum()) < 2:
         raise InputError("orbit: expected at least two exposures within it, found fewer; fly longer")
     sight = truth.joints3d[:, 0, :2] - truth.camera_position[:, :2]

@@ -30,11 +30,6 @@ class Renderer:
     camera_matrix : (3, 3) px without skew, pixel centres at whole numbers
     width, height : px of the images
     seed : of the scenery and of the look of the person
-
-    Raises
-    ------
-    InputError
-        When matrix or size is invalid.
     """
 
     def __init__(self, camera_matrix: np.ndarray, width: int, height: int, seed: int = 0) -> None:
@@ -55,11 +50,6 @@ class Renderer:
         joints3d : (17, 3) m, world ENU, order of ``BODY_17``; (15, 3) without toes, which the feet then assume
         rotation : (3, 3) world -> camera (x right, y down, z forward)
         position : (3,) m, of the camera, world ENU
-
-        Raises
-        ------
-        InputError
-            When an array has another shape or is not finite.
         """
         arrays = {
             "joints3d": (joints3d, (len(BODY_17 if np.shape(joints3d) == (len(BODY_17), 3) else BODY_15), 3)),

@@ -46,11 +46,6 @@ class SimulatedVehicle:
     max_rate_hz : highest delivered rate, whatever was requested and acknowledged (a slow link)
     boot_s : time since boot at path time 0
     signing_key : 32 bytes; it then signs its packets and drops unsigned ones
-
-    Raises
-    ------
-    InputError
-        When the autopilot is unknown or the URL is invalid.
     """
 
     def __init__(
