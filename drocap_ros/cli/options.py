@@ -33,7 +33,7 @@ class LineParser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """As of argparse; refuses unknown words and empty ones: a path of an unset variable is the working directory."""
+        """As of argparse; refuses unknown words and empty ones: the path of an unset variable is this directory."""
         words = sys.argv[1:] if args is None else list(args)
         found, unknown = super().parse_known_args(words, namespace)
         if unknown:
