@@ -1,13 +1,13 @@
 """Accuracy studies over MoCap and simulation: `python benchmarks/accuracy.py`, or some of its parts by name.
 
-rotation     every method at four orbit speeds, clean and noisy 2D (`drocap evaluate rotation`): page accuracy
+rotation     every method at four orbit speeds, clean and noisy 2D (`python -m lab rotation`): page accuracy
 live         the live method beside the offline one, clean and noisy 2D: page accuracy_live
 live-world   the live method in the world beside the offline one, every third sequence: page accuracy_live_world
 perspective  the default method with a camera 6 m and 10 m away, lens known and unknown: page accuracy_perspective
 near         cameras from 3.3 m on, exact 2D; lens, rotation and position known or not, the lens assumed; the
              camera pitched, rolled and turned aside: page accuracy_near
 world        placement and scale from telemetry, on simulated captures: page accuracy_world
-telemetry    the motion in the world by telemetry that errs (`drocap evaluate world`), every third sequence: page
+telemetry    the motion in the world by telemetry that errs (`python -m lab world`), every third sequence: page
              accuracy_telemetry
 together     two cameras 120 degrees apart whose times and places nobody knows (`drocap reconstruct A B --together`),
              every third sequence: page accuracy_together
@@ -36,18 +36,6 @@ from drocap_ros.cli.progress import progress_bars
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
-from drocap_ros.evaluation.protocol import (
-    FPS,
-    IMAGE_SIZE,
-    NOISE_MM,
-    PX_PER_MM,
-    orbit_rotations,
-    protocol_sequences,
-)  # fmt: skip
-from drocap_ros.evaluation.rotation import rotation_study
-from drocap_ros.evaluation.tables import rotation_markdown, world_markdown
-from drocap_ros.evaluation.world import world_study
-from drocap_ros.evaluation.world_protocol import NONE, WorldCase, world_sequences
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
@@ -62,8 +50,19 @@ from lab.studies.live_world import live_world_markdown, live_world_study
 from lab.studies.near_camera import DISTANCES_M, NearCamera, error_mm, known, without_camera
 from lab.studies.planned_flight import SECONDS as PLANNED_S
 from lab.studies.planned_flight import planned_markdown, planned_study
+from lab.studies.protocol import (
+    FPS,
+    IMAGE_SIZE,
+    NOISE_MM,
+    PX_PER_MM,
+    orbit_rotations,
+    protocol_sequences,
+)  # fmt: skip
 from lab.studies.real_people import SYSTEMS, real_people_study
+from lab.studies.rotation import rotation_markdown, rotation_study
 from lab.studies.together import together_markdown, together_study
+from lab.studies.world import world_markdown, world_study
+from lab.studies.world_protocol import NONE, WorldCase, world_sequences
 
 SPEED_DEG_S = 25.0
 SOLUTION_DELAY_S = 0.5

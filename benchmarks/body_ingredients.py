@@ -19,12 +19,12 @@ import numpy as np
 from body import ROOT, Score, long_enough, score
 from figures import table, write_figures
 
-from drocap_ros.mocap import mocap_files
 from drocap_ros.reconstruction.lifted import adjustment, window_solver
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.network import LiftedMotion, LifterInput
 from drocap_ros.reconstruction.methods import ba
+from lab.studies.protocol import mocap_files
 
 MEASURED = ("clean", "clean, camera's rotation known", "noisy", "correlated noise, covariance given")
 

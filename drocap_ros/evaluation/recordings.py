@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from drocap_ros.clip import Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.compare import TRUTH_SUFFIXES, MotionErrors, compare, load_truth
-from drocap_ros.evaluation.protocol import Progress, reported
 from drocap_ros.pipeline import reconstruct_input
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
@@ -82,14 +82,15 @@ def recordings_table(
     methods: Iterable[str],
     config: DrocapConfig,
     models: Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda _stage, _done: None,
 ) -> list[RecordingRow]:
     """Every method on every recording, whose 2D poses are estimated once; one that cannot be used is left out."""
     rows: list[RecordingRow] = []
-    for recording in reported(recordings, len(recordings), "recordings", progress):
+    for done, recording in enumerate(recordings):
+        progress("recordings", done / len(recordings))
         try:
             rows += _measured(recording, tuple(methods), config, models)
-        except InputError as error:  # noqa: PERF203  # each takes seconds to minutes
+        except InputError as error:  # each takes seconds to minutes
             logger.warning("%s: left out: %s", recording.name, error)
     if not rows:
         raise InputError("evaluate table: expected a recording that can be used, found none; see the lines above")

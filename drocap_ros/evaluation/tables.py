@@ -1,4 +1,4 @@
-"""Errors and results of the studies as CSV, Markdown and plots."""
+"""Errors as CSV, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -15,15 +15,12 @@ import numpy as np
 from drocap_ros.evaluation.compare import MotionErrors, WorldErrors
 from drocap_ros.evaluation.metrics import JOINT_GROUPS
 from drocap_ros.evaluation.recordings import RecordingRow
-from drocap_ros.evaluation.rotation import RotationRow
-from drocap_ros.evaluation.world import WorldRow, world_means
-from drocap_ros.evaluation.world_protocol import WorldCase
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_Row = TypeVar("_Row", RotationRow, RecordingRow)
+_Row = TypeVar("_Row", bound=RecordingRow)
 _LABELS = {
     "ba": "default (`ba`)",
     "paper": "paper: bundle adjustment",
@@ -31,8 +28,6 @@ _LABELS = {
     "initial": "paper: single-view initialization",
     "mf-nnm": "MF+NNM",
 }
-#: Speed of the tables per joint group and per sequence, deg/s: that of the demo's orbit.
-_SPEED_DEG_S = 25.0
 #: Column -> error in the world, its factor and its form.
 _WORLD = {
     "PA-MPJPE mm": ("pa_mm", 1, ".1f"),
@@ -92,9 +87,10 @@ def errors_record(e: MotionErrors | WorldErrors) -> dict[str, object]:
     return record
 
 
-def study_record(row: RotationRow | WorldRow | RecordingRow) -> dict[str, object]:
-    """One result of a study as columns for :func:`save_csv`."""
-    return {key: value for key, value in vars(row).items() if key != "errors"} | errors_record(row.errors)
+def study_record(row: object) -> dict[str, object]:
+    """One row of a table or a study as columns for :func:`save_csv`."""
+    record = dict(vars(row))
+    return record | errors_record(record.pop("errors"))
 
 
 def comparison_markdown(name: str, e: MotionErrors) -> str:
@@ -110,48 +106,18 @@ def comparison_markdown(name: str, e: MotionErrors) -> str:
     return "\n".join(tables) + "\n"
 
 
-def rotation_markdown(rows: list[RotationRow]) -> str:
-    """Error over speed, error per joint group, and error per sequence, as Markdown."""
-    speeds = sorted({r.speed_deg_s for r in rows})
-    speed = _SPEED_DEG_S if _SPEED_DEG_S in speeds else speeds[-1]
-    by_method = _by_method(rows)
-    by_speed = [_speed_cells(method, of, speeds) for method, of in by_method.items()]
-    at_speed = _by_method([r for r in rows if r.speed_deg_s == speed])
-    per_sequence = [_sequence_cells(same) for same in zip(*at_speed.values(), strict=True)]
-    kind = "noisy" if rows[0].noisy else "clean"
-    lines = [
-        f"Reconstruction error in mm, mean over {len(per_sequence)} sequences, {kind} 2D, by orbit speed in deg/s.",
-        "",
-        *markdown_table(["method", *(f"{s:g}" for s in speeds), "mirrored"], by_speed),
-        *("", f"Per joint group at {speed:g} deg/s, mm.", ""),
-        *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(_group_cells, at_speed.items()))),
-        *("", f"Per sequence at {speed:g} deg/s, mm.", ""),
-        *markdown_table(["sequence", *(label(m) for m in by_method)], per_sequence),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _sequence_cells(rows: tuple[RotationRow, ...]) -> list[str]:
-    """The sequence and its error by every method."""
-    return [rows[0].sequence, *(f"{r.errors.error_mm:.1f}" for r in rows)]
-
-
-def _speed_cells(method: str, rows: list[RotationRow], speeds: list[float]) -> list[str]:
-    return [label(method), *(f"{_mean_mm(rows, s):.1f}" for s in speeds), str(sum(r.errors.mirrored for r in rows))]
-
-
 def recordings_markdown(rows: list[RecordingRow]) -> str:
     """The paper's tables: mean error by method and recording, and per joint group; errors in the world where known."""
-    by_method, names = _by_method(rows), list(dict.fromkeys(row.sequence for row in rows))
-    means = {m: np.mean([row.errors.error_mm for row in of]) for m, of in by_method.items()}
+    of_method, names = by_method(rows), list(dict.fromkeys(row.sequence for row in rows))
+    means = {m: np.mean([row.errors.error_mm for row in of]) for m, of in of_method.items()}
     cells = [
-        [label(m), *(f"{row.errors.error_mm:.1f}" for row in of), f"{means[m]:.1f}"] for m, of in by_method.items()
+        [label(m), *(f"{row.errors.error_mm:.1f}" for row in of), f"{means[m]:.1f}"] for m, of in of_method.items()
     ]
     lines = [
         *("Reconstruction error in mm.", ""),
         *markdown_table(["method", *names, "mean"], cells),
         *("", "Per joint group, mm.", ""),
-        *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(_group_cells, by_method.items()))),
+        *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(group_cells, of_method.items()))),
     ]
     placed = [(f"{r.sequence}, {label(r.method)}", r.errors.world) for r in rows if r.errors.world is not None]
     if placed:
@@ -160,15 +126,12 @@ def recordings_markdown(rows: list[RecordingRow]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _by_method(rows: list[_Row]) -> dict[str, list[_Row]]:
+def by_method(rows: list[_Row]) -> dict[str, list[_Row]]:
+    """Rows of each method, in the order of their first ones."""
     return {method: [r for r in rows if r.method == method] for method in dict.fromkeys(r.method for r in rows)}
 
 
-def _mean_mm(rows: list[RotationRow], speed: float) -> float:
-    return float(np.mean([r.errors.error_mm for r in rows if r.speed_deg_s == speed]))
-
-
-def _group_cells(method: str, rows: list[_Row]) -> list[str]:
+def group_cells(method: str, rows: Sequence[RecordingRow]) -> list[str]:
     """The method and its mean error per joint group and of the toes, "-" where no row knows it."""
     errors = [r.errors for r in rows]
     groups: list[np.floating] = [np.mean([e.per_group_mm[group] for e in errors]) for group in JOINT_GROUPS]
@@ -176,43 +139,16 @@ def _group_cells(method: str, rows: list[_Row]) -> list[str]:
     return [label(method), *(f"{g:.1f}" for g in groups), f"{np.mean(toes):.1f}" if toes else "-"]
 
 
-def world_markdown(rows: list[WorldRow], case: WorldCase) -> str:
-    """Errors of every sequence and their means as Markdown."""
-    cells = [[row.sequence, *world_cells(row.errors)] for row in rows]
-    seconds = sum(row.seconds for row in rows) / sum(row.frames for row in rows) * 300
-    measured, placed = sum(row.metric for row in rows), sum(row.frame == "world" for row in rows)
-    lines = [
-        f"Motion in the world, {len(rows)} sequences, {case.words()}.",
-        "",
-        *markdown_table(["sequence", *WORLD_HEAD], [*cells, ["mean", *world_cells(world_means(rows))]]),
-        "",
-        f"In the world {placed}, with measured scale {measured} of {len(rows)}; {seconds:.2f} s per 300 frames.",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def save_curves(path: Path, rows: list[RotationRow]) -> None:
-    """Error over orbit speed, one curve per method, as PNG."""
-    figure, axes = _plot(6.4, 4.2)
-    for method, found in _by_method(rows).items():
-        speeds = sorted({r.speed_deg_s for r in found})
-        axes.plot(speeds, [_mean_mm(found, s) for s in speeds], marker="o", label=label(method))
-    axes.set(xlabel="orbit speed, deg/s", ylabel="reconstruction error, mm")
-    axes.set_title(f"{len({r.sequence for r in rows})} sequences, {'noisy' if rows[0].noisy else 'clean'} 2D")
-    axes.set_ylim(bottom=0)
-    axes.legend()
-    figure.savefig(path, dpi=120)
-
-
 def save_group_bars(path: Path, e: MotionErrors) -> None:
     """Error per joint group as PNG."""
-    figure, axes = _plot(6.4, 3.6)
+    figure, axes = plot(6.4, 3.6)
     axes.bar(list(JOINT_GROUPS), [e.per_group_mm[g] for g in JOINT_GROUPS])
     axes.set_ylabel("error, mm")
     figure.savefig(path, dpi=120)
 
 
-def _plot(width: float, height: float) -> tuple[Figure, Axes]:
+def plot(width: float, height: float) -> tuple[Figure, Axes]:
+    """An empty figure of a size in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from walking import make_walk, write_mocap
 
-from drocap_ros.evaluation import protocol
+from lab.studies import protocol
 
 
 def test_camera_orbits_at_its_speed_and_looks_down() -> None:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from drocap_ros.evaluation.compare import WorldErrors, place_covariance, world_errors
-from drocap_ros.evaluation.protocol import FPS, Progress, reported
-from drocap_ros.evaluation.world_protocol import WorldCase, world_view
-from drocap_ros.mocap import Sequence
+from drocap_ros.evaluation.tables import WORLD_HEAD, markdown_table, world_cells
 from drocap_ros.reconstruction.reconstruct import reconstruct
+from lab.studies.protocol import FPS, Progress, Sequence, reported
+from lab.studies.world_protocol import WorldCase, world_view
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def world_study(
     method: str = "ba",
     progress: Progress | None = None,
 ) -> list[WorldRow]:
-    """Every sequence of :func:`~drocap_ros.evaluation.world_protocol.world_sequences`, with its own seed."""
+    """Every sequence of :func:`~lab.studies.world_protocol.world_sequences`, with its own seed."""
     return [
         measure_world(sequence, case or WorldCase(), seed=seed + own, method=method)
         for own, sequence in reported(sequences, len(sequences), "world study", progress)
@@ -62,3 +62,18 @@ def world_means(rows: list[WorldRow]) -> WorldErrors:
         return float((np.abs(values) if name == "scale" else values).mean()) if len(values) else float("nan")
 
     return WorldErrors(**{field.name: mean(field.name) for field in fields(WorldErrors)})
+
+
+def world_markdown(rows: list[WorldRow], case: WorldCase) -> str:
+    """Errors of every sequence and their means as Markdown."""
+    cells = [[row.sequence, *world_cells(row.errors)] for row in rows]
+    seconds = sum(row.seconds for row in rows) / sum(row.frames for row in rows) * 300
+    measured, placed = sum(row.metric for row in rows), sum(row.frame == "world" for row in rows)
+    lines = [
+        f"Motion in the world, {len(rows)} sequences, {case.words()}.",
+        "",
+        *markdown_table(["sequence", *WORLD_HEAD], [*cells, ["mean", *world_cells(world_means(rows))]]),
+        "",
+        f"In the world {placed}, with measured scale {measured} of {len(rows)}; {seconds:.2f} s per 300 frames.",
+    ]
+    return "\n".join(lines) + "\n"

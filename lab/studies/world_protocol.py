@@ -15,12 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import FPS, protocol_sequences
-from drocap_ros.evaluation.world_scene import PinholePath, followed_points
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.mocap import Sequence
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
 from drocap_ros.tracks import Tracks
+from lab.studies.protocol import FPS, Sequence, protocol_sequences
+from lab.studies.world_scene import PinholePath, followed_points
 
 # The numbers of the protocol; docs/accuracy.md compares under them.
 SHORTEST_S = 8.0

@@ -1,4 +1,4 @@
-"""``drocap learn-dictionary``: learn a pose dictionary from a folder of MoCap files."""
+"""``python -m lab learn-dictionary``: learn a pose dictionary from a folder of MoCap files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Learn and write the dictionary, print its quality."""
     from drocap_ros.cli.atomic_output import output_file
-    from drocap_ros.reconstruction.paper.dictionary import save_dictionary
+    from lab.training.dictionary import save_dictionary
 
     for name, low, high in (("atoms", 8, 4096), ("every", 1, 1000)):
         if not low <= getattr(args, name) <= high:
@@ -61,10 +61,12 @@ def learn_from_folder(args: argparse.Namespace) -> Dictionary:
     import numpy as np
 
     from drocap_ros.cli.progress import progress_bars
-    from drocap_ros.mocap import load_mocap, mocap_files
+    from drocap_ros.mocap import load_mocap
     from drocap_ros.reconstruction.common.threads import blas_threads
-    from drocap_ros.reconstruction.paper.dictionary import Learning, learn, normalize_poses
+    from drocap_ros.reconstruction.paper.dictionary import normalize_poses
     from drocap_ros.tracks import read_npz
+    from lab.studies.protocol import mocap_files
+    from lab.training.dictionary import Learning, learn
 
     files = mocap_files(args.folder, args.include)
     poses, frames, stated = [], 0, []
@@ -80,7 +82,7 @@ def learn_from_folder(args: argparse.Namespace) -> Dictionary:
         "every": args.every,
         "licence": sorted({facts["licence"] for facts in stated if "licence" in facts}),
         "origin": sorted({facts["source"] for facts in stated if "source" in facts}),
-        "command": f"drocap learn-dictionary MOCAP_DIR --out NPZ --include '{args.include}' --every {args.every}"
+        "command": f"python -m lab learn-dictionary MOCAP_DIR --out NPZ --include '{args.include}' --every {args.every}"
         f" --atoms {args.atoms} --sparsity {args.sparsity:g} --seed {args.seed}",
     }
     with progress_bars(args.quiet) as show, blas_threads(1):

@@ -1,4 +1,4 @@
-"""drocap learn-dictionary."""
+"""python -m lab learn-dictionary."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from walking import write_mocap
 
-from drocap_ros.cli import learn_dictionary
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.paper import dictionary
-from drocap_ros.reconstruction.paper.dictionary import load_dictionary
+from drocap_ros.reconstruction.paper.dictionary import Dictionary, load_dictionary
+from lab.commands import learn_dictionary
+from lab.training import dictionary
 
 
 def command(*words: str) -> argparse.Namespace:
@@ -68,7 +68,7 @@ def test_a_failure_keeps_the_old_dictionary(tmp_path: Path, monkeypatch: pytest.
     write_mocap(tmp_path, "one_1")
     out = tmp_path / "d.npz"
     out.write_bytes(b"old")
-    monkeypatch.setattr("drocap_ros.reconstruction.paper.dictionary.save_dictionary", fill_disk)
+    monkeypatch.setattr("lab.training.dictionary.save_dictionary", fill_disk)
     args = command(str(tmp_path), "--out", str(out), "--include", "one_*", "--atoms", "16", "--quiet")
     with pytest.raises(OSError, match="no space"):
         args.run(args)
@@ -81,7 +81,7 @@ def test_learning_uses_one_thread_whatever_the_environment_says(
 ) -> None:
     used: set[int] = set()
 
-    def spied(*args: Any, **options: Any) -> dictionary.Dictionary:
+    def spied(*args: Any, **options: Any) -> Dictionary:
         used.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
         return learn(*args, **options)
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.mocap import Sequence, load_mocap, mocap_files
+from drocap_ros.mocap import load_mocap
 from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
 
@@ -36,6 +37,14 @@ IMAGE_SIZE = (1280, 1024)
 
 
 @dataclass(frozen=True)
+class Sequence:
+    """MoCap of one take: ``x`` (F, P, 3) mm, world z up, joints of BODY_17, or of BODY_15 without known toes."""
+
+    name: str
+    x: np.ndarray
+
+
+@dataclass(frozen=True)
 class OrbitView:
     """A sequence as the virtual camera sees it.
 
@@ -47,6 +56,17 @@ class OrbitView:
     tracks: Tracks
     truth: np.ndarray
     rotation: np.ndarray
+
+
+def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
+    """``.npz`` files of a folder by name; ``include`` is a glob on the name without its ending."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of MoCap .npz files; no such folder")
+    files = sorted(path for path in folder.glob("*.npz") if fnmatchcase(path.stem, include))
+    if not files:
+        raise InputError(f"{folder}: expected MoCap files {include}.npz, found none; check the folder and the pattern")
+    return files
 
 
 def protocol_sequences(
