@@ -15,6 +15,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.balance import balanced
 from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
+from drocap_ros.reconstruction.camera.cuts import cut_times
 from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, with_causes
 from drocap_ros.reconstruction.camera.kinds import Kind
 from drocap_ros.reconstruction.camera.picture_world import (
@@ -33,7 +34,6 @@ from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.person_view import aside, lens_word, person_view, true_shape, with_lens
 from drocap_ros.reconstruction.shared_camera import SharedCamera, held, lower_ankle
-from drocap_ros.reconstruction.shots import joined, part_of, shots_meta, shots_of
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.refine import refinable
 from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
@@ -97,24 +97,17 @@ def reconstruct(
     Motion
         In frame "world" when the tracks hold the camera's rotation, else in frame "camera"; with the joints of the
         method, ``BODY_17`` or ``BODY_15``, and by the default method with the heels where the tracks hold them.
-        Where fixed points show cuts, each shot has a camera of its own; without one for each, frame "camera" it is.
+        A clip without telemetry whose fixed points show cuts has no camera: frame "camera", ``meta["cuts_s"]``.
     """
-
-    def of(clip: Tracks, progress: Progress | None) -> Motion:
-        return reconstruct_with_camera(
-            clip, method=method, initializer=initializer, adjuster=adjuster, progress=progress
-        )[0]
-
-    shots = shots_of(tracks)
-    if not shots.cuts:
-        return of(tracks, progress)
-    motions = [of(shot, part_of(progress, n, len(shots.tracks))) for n, shot in enumerate(shots.tracks)]
-    if all(motion.frame == "world" for motion in motions):
-        motion = joined(motions)
-    else:
-        motion = of(dataclasses.replace(tracks, background=None), progress)
-    motion.meta.update(shots_meta(tracks, shots, motions))
-    return motion
+    cuts_s = cut_times(tracks)
+    motion, _ = reconstruct_with_camera(
+        dataclasses.replace(tracks, background=None) if cuts_s else tracks,
+        method=method,
+        initializer=initializer,
+        adjuster=adjuster,
+        progress=progress,
+    )
+    return dataclasses.replace(motion, meta={**motion.meta, "cuts_s": cuts_s}) if cuts_s else motion
 
 
 def reconstruct_with_camera(
