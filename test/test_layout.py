@@ -76,7 +76,7 @@ BUDGETS = {
     # `sample` (0.05), a look through the camera (0.04), completion and proposals (0.04), images found (0.02),
     # `evaluate table` (0.04), threads and one bar (0.05), several recordings together (0.15), several persons
     # (0.14), picture of a plan (0.20)
-    ("lab", "benchmarks"): 12.15,  # 0.86 over the plan: studies and replay of reports; hours of healthy flight (0.08);
+    ("lab", "benchmarks"): 11.30,  # 0.86 over the plan: studies and replay of reports; hours of healthy flight (0.08);
     # near cameras and simulated evidence (0.14); what a lab may choose about one who walks (0.05); damaged files of
     # every reader (0.15); two cameras (0.10), of unlike flights (0.02); peers on the same clip (0.10);
     # several persons (0.12); deaths of the bridge and of its computer (0.03); people's shoulders and phones in the
