@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from figures import ROOT, table, write_figures
 
-from drocap_ros.cli.progress import progress_bars
+from drocap_ros.cli.running import progress_bars
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe

@@ -85,10 +85,10 @@ def _compare(args: argparse.Namespace) -> int:
 
 def _table(args: argparse.Namespace) -> int:
     """The paper's tables over recordings with truth."""
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.running import progress_bars
     from drocap_ros.config import load_config
     from drocap_ros.evaluation import tables
-    from drocap_ros.evaluation.recordings import PAPER_METHODS, find_recordings, recordings_table
+    from drocap_ros.evaluation.tables import PAPER_METHODS, find_recordings, recordings_table
 
     check_out(args)
     recordings, config = find_recordings(args.folder), load_config(args.config)

@@ -60,7 +60,7 @@ def learn_from_folder(args: argparse.Namespace) -> Dictionary:
     """Dictionary from every n-th frame of the files of a MoCap folder whose names match ``--include``."""
     import numpy as np
 
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.running import progress_bars
     from drocap_ros.mocap import load_mocap
     from drocap_ros.reconstruction.common.threads import blas_threads
     from drocap_ros.reconstruction.paper.dictionary import normalize_poses

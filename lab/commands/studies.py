@@ -7,7 +7,7 @@ from pathlib import Path
 
 from drocap_ros.cli.evaluate import METHODS, add_out, check_out, finish
 from drocap_ros.cli.options import Subparsers, add_command, add_quiet_option, add_seed_option
-from drocap_ros.cli.progress import progress_bars
+from drocap_ros.cli.running import progress_bars
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -17,8 +17,7 @@ import psutil
 import pytest
 
 from drocap_ros.cli import main
-from drocap_ros.cli.batch.recording import Task
-from drocap_ros.cli.batch.workers import run_on_this_machine
+from drocap_ros.cli.batch_recording import Task, run_on_this_machine
 from drocap_ros.motion import load_motion
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.capture import simulate_capture

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from drocap_ros.cli.batch.inputs import read_inputs
-from drocap_ros.cli.batch.recording import content_digest, fingerprint, stat_digest
+from drocap_ros.cli.batch import read_inputs
+from drocap_ros.cli.batch_recording import content_digest, fingerprint, stat_digest
 
 
 @pytest.fixture

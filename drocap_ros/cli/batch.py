@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import copy
 import fcntl
+import glob
+import itertools
 import json
 import re
+import shlex
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drocap_ros.cli.options import Subparsers, add_command, add_quiet_option
+from drocap_ros.cli.options import LineParser, Subparsers, add_command, add_quiet_option
 from drocap_ros.cli.reconstruct import add_options
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
-    from drocap_ros.cli.batch.recording import Record, Task
+    from drocap_ros.cli.batch_recording import Record, Task
+
 
 LOG_FILE, PAGE_FILE = "batch.jsonl", "summary.html"
 #: Period of the page while the batch runs, s (docs/batch.md).
@@ -60,7 +65,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Reconstruct what is not done yet; status 1 when a recording failed."""
     from drocap_ros.cli.atomic_output import check_output_folder
-    from drocap_ros.cli.batch.recording import RECORD_FILE
+    from drocap_ros.cli.batch_recording import RECORD_FILE
 
     if args.jobs < 1:
         raise InputError(f"--jobs: expected at least 1, got {args.jobs}; correct the number")
@@ -90,8 +95,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _read_tasks(args: argparse.Namespace) -> list[Task]:
     """A task for each recording that the arguments name, each once."""
-    from drocap_ros.cli.batch.inputs import read_inputs
-    from drocap_ros.cli.batch.recording import Task, content_digest, fingerprint, stat_digest, version
+    from drocap_ros.cli.batch_recording import Task, content_digest, fingerprint, stat_digest, version
 
     options = argparse.ArgumentParser()
     add_options(options)
@@ -148,7 +152,7 @@ def _remove_left_overs(out: Path) -> None:
 
 def _split(tasks: list[Task], out: Path) -> tuple[list[Record], list[Task]]:
     """Records of the tasks that are done, from the log and the folders; the other tasks."""
-    from drocap_ros.cli.batch.recording import RECORD_FILE
+    from drocap_ros.cli.batch_recording import RECORD_FILE
 
     logged: dict[str, Record] = {}
     if (out / LOG_FILE).exists():
@@ -169,9 +173,8 @@ def _split(tasks: list[Task], out: Path) -> tuple[list[Record], list[Task]]:
 def _reconstruct(args: argparse.Namespace, records: list[Record], todo: list[Task]) -> None:
     """Run the tasks; their records are added to ``records``, to the log and, from time to time, to the page."""
     from drocap_ros.cli.atomic_output import output_file
-    from drocap_ros.cli.batch.summary import save_summary
-    from drocap_ros.cli.batch.workers import run_on_cluster, run_on_this_machine
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.batch_recording import run_on_cluster, run_on_this_machine, save_summary
+    from drocap_ros.cli.running import progress_bars
 
     total = len(records) + len(todo)
 
@@ -199,3 +202,84 @@ def _reconstruct(args: argparse.Namespace, records: list[Record], todo: list[Tas
                     saved = save_page()
     finally:
         save_page()
+
+
+#: Endings by which a folder's recordings are found; a recording that is named itself may end in anything.
+_RECORDINGS = (
+    ".npz", ".mcap", ".bag", ".db3",
+    ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".wmv", ".mjpeg",
+)  # fmt: skip
+_LIST = ".txt"
+
+
+def read_inputs(words: Iterable[str], defaults: argparse.Namespace) -> list[argparse.Namespace]:
+    """Arguments of ``drocap reconstruct``, one set per recording.
+
+    Parameters
+    ----------
+    words : lists (``.txt``), folders, glob patterns and recordings
+    defaults : options of ``reconstruct``; a line of a list may change them
+    """
+    found: list[argparse.Namespace] = []
+    for word in words:
+        before = len(found)
+        for path in [Path(word)] if Path(word).exists() else map(Path, sorted(glob.glob(word, recursive=True))):
+            if path.suffix.lower() == _LIST and path.is_file():
+                found += _read_list(path, defaults)
+            else:
+                found += [_arguments(each, defaults) for each in (_in_folder(path) if path.is_dir() else [path])]
+        if len(found) == before:
+            raise InputError(f"{word}: expected a list, folder, pattern or recording, found none; check the path")
+    return found
+
+
+def _arguments(recording: Path, defaults: argparse.Namespace) -> argparse.Namespace:
+    arguments = copy.copy(defaults)
+    arguments.input = recording
+    return arguments
+
+
+def _read_list(path: Path, defaults: argparse.Namespace) -> list[argparse.Namespace]:
+    """One recording per line, with options of ``reconstruct`` after its path; ``#`` begins a comment line."""
+    from drocap_ros.cli.reconstruct import add_options
+
+    parser = LineParser("drocap reconstruct", add_help=False)
+    parser.add_argument("input", type=Path)
+    add_options(parser)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected a text file with one recording per line; {error}") from None
+    found = []
+    for number, line in enumerate(map(str.strip, lines), 1):
+        if not line or line.startswith("#"):
+            continue
+        if Path(line).exists():  # names with spaces need no quotes
+            found.append(_arguments(Path(line), defaults))
+            continue
+        try:
+            found.append(parser.parse_args(shlex.split(line), copy.copy(defaults)))
+        except (ValueError, InputError) as error:
+            raise InputError(f"{path}:{number}: expected a path and options of reconstruct; {error}") from None
+    return found
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    """Recordings at any depth; a session, or a folder of images alone, is one recording."""
+    from drocap_ros.perception.sources.image_files import SUFFIXES as IMAGES
+    from drocap_ros.recording.mcap.metadata import METADATA_FILE
+
+    if (folder / METADATA_FILE).is_file():
+        return [folder]
+    entries = sorted(folder.glob("[!.]*"))
+    folders = [path for path in entries if path.is_dir() and not path.is_symlink()]
+    inside = list(itertools.chain.from_iterable(map(_in_folder, folders)))
+    if (folder / "motion.npz").exists():  # the files are a result
+        return inside
+    files = _of_kinds(entries, _RECORDINGS)
+    images_alone = not (files or folders) and _of_kinds(entries, IMAGES)
+    return [folder] if images_alone else files + inside
+
+
+def _of_kinds(entries: list[Path], suffixes: Collection[str]) -> list[Path]:
+    return [path for path in entries if path.suffix.lower() in suffixes and path.is_file()]

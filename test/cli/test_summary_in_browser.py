@@ -3,7 +3,7 @@
 import pytest
 from browser import Browser, chromium
 
-from drocap_ros.cli.batch.summary import save_summary
+from drocap_ros.cli.batch_recording import save_summary
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome on this machine")
 
