@@ -16,6 +16,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.balance import balanced
 from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
+from drocap_ros.reconstruction.camera.cuts import cut_times
 from drocap_ros.reconstruction.camera.fusion import fuse_telemetry, with_causes
 from drocap_ros.reconstruction.camera.picture_world import picture_camera, with_camera
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
@@ -80,8 +81,12 @@ def reconstruct(
     Motion
         In frame "world" when the tracks hold the camera's rotation, else in frame "camera"; with the joints of the
         method, ``BODY_17`` or ``BODY_15``, and by the default method with the heels where the tracks hold them.
+        A clip without telemetry whose fixed points show cuts has no camera: frame "camera", ``meta["cuts_s"]``.
     """
-    return solve(tracks, method=method, initializer=initializer, adjuster=adjuster, progress=progress).motion
+    cuts_s = cut_times(tracks)
+    clip = dataclasses.replace(tracks, background=None) if cuts_s else tracks
+    motion = solve(clip, method=method, initializer=initializer, adjuster=adjuster, progress=progress).motion
+    return dataclasses.replace(motion, meta={**motion.meta, "cuts_s": cuts_s}) if cuts_s else motion
 
 
 def solve(

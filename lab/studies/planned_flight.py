@@ -14,8 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.evaluation.compare import world_errors
-from drocap_ros.evaluation.protocol import FPS, Progress, reported, resample
-from drocap_ros.evaluation.world_protocol import FOCAL_PX, IMAGE_SIZE
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.orbit.planner import OrbitState, reference_position
 from drocap_ros.flight.orbit.view_plan import choose_view, fly_plan, reach_of
@@ -28,6 +26,8 @@ from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import look_at
 from drocap_ros.skeleton import BODY_17, indices
 from drocap_ros.tracks import Tracks
+from lab.studies.protocol import FPS, Progress, reported, resample
+from lab.studies.world_protocol import FOCAL_PX, IMAGE_SIZE
 
 #: Walks, squats, boxing, arms that the body hides or that move.
 SEQUENCES = (

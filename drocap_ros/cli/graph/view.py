@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 from drocap_ros.cli.atomic_output import output_file
 from drocap_ros.cli.graph.common import add_domain_option, chosen_domain, import_bringup
 from drocap_ros.cli.options import Subparsers, add_command, read_motion, ros_namespace
-from drocap_ros.cli.progress import progress_bars
-from drocap_ros.cli.signals import interruptible, stop_signals
+from drocap_ros.cli.running import interruptible, progress_bars, stop_signals
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
