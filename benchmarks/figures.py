@@ -18,8 +18,7 @@ One page per part that can run alone:
     recording.py        recording_load, recording_kills, recording_mutations, recording_long, recording_live
     live.py             live_load, live_memory, live_kills
     flight_*.py         flight_faults, flight_processes, flight_orbits, flight_quality, flight_pixels, flight_fuzz,
-                        flight_replay, flight_field, flight_kills, flight_pilot, flight_choices, flight_planned,
-                        flight_faults_planned
+                        flight_replay, flight_field, flight_kills, flight_pilot, flight_choices
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
 from visualization_msgs.msg import ImageMarker, MarkerArray
 
-from drocap_ros.msg import BackgroundTracks, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState, ViewForecast
+from drocap_ros.msg import BackgroundTracks, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.srv import OrbitCommand
 
 try:
@@ -61,7 +61,6 @@ TOPICS: dict[str, Topic] = {
     "background": Topic(BackgroundTracks, RESULT_QOS, one_clock=True),
     "pose3d/initial": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS, one_clock=True),
-    "pose3d/views": Topic(ViewForecast, RESULT_QOS, one_clock=True),
     "pose3d/latest": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "vehicle/state": Topic(VehicleState, RESULT_QOS, one_clock=True),
     "orbit/status": Topic(OrbitStatus, RESULT_QOS),
@@ -114,8 +113,8 @@ NODES: dict[str, NodeEntry] = {
     "capture_simulator": NodeEntry(("pose2d", "camera_info"), source=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(
-        ("pose3d/refined", "pose3d/views", "pose3d/latest", *_TF),
-        ("pose2d", "pose3d/initial", "background", "vehicle/state", "camera_info", "orbit/status"),
+        ("pose3d/refined", "pose3d/latest", *_TF),
+        ("pose2d", "pose3d/initial", "background", "vehicle/state", "camera_info"),
         live=True,
         niceness=15,
     ),
@@ -143,7 +142,7 @@ NODES: dict[str, NodeEntry] = {
         for place in PLACES
     },
     "mavlink_bridge": NodeEntry(
-        ("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status", "pose3d/views"), live=True
+        ("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status"), live=True
     ),
     "visualizer": NodeEntry(
         ("markers/keypoints", "markers/initial", "markers/latest", "markers/camera_path", *_TF),

@@ -247,7 +247,7 @@ def test_a_namespace_that_ros_does_not_know_is_refused(command, namespace, capsy
 
 def test_an_adjustment_without_a_value_is_refused(capsys):
     assert main(["orbit", "adjust", "--timeout", "0.1"]) == 2
-    assert "expected --radius, --height, --speed or --plan, got none" in capsys.readouterr().err
+    assert "expected --radius, --height or --speed, got none" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("action", ["start", "adjust"])
