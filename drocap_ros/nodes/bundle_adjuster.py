@@ -101,11 +101,10 @@ class BundleAdjusterNode(ComponentNode):
         self._uncalibrated = ""  # why the images have no calibration
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
-        self._tf = self.output("/tf") if TFMessage is not None and not self.person else None
+        self._tf = self.output("/tf") if TFMessage is not None else None
         self.input("pose2d", self._on_pose2d)
         self.input("pose3d/initial", self._on_initial)
-        if not self.person:
-            self.input("background", self._on_background)
+        self.input("background", self._on_background)
         self.input("vehicle/state", partial(add_state, self._cameras))
         self.input("camera_info", partial(add_calibration, self._cameras))
 

@@ -20,7 +20,7 @@ from drocap_ros.config import DrocapConfig, section_types
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.ros.conversions import stamp_from_ros
-from drocap_ros.ros.topics import NODES, TOPICS, component_of, section_of
+from drocap_ros.ros.topics import NODES, TOPICS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 from drocap_ros.srv import OrbitCommand
 
@@ -188,9 +188,9 @@ def test_table_of_the_nodes_names_existing_topics():
 
 
 def test_every_node_has_a_module_and_a_section_of_the_configuration():
-    assert {section_of(name) for name in NODES} == set(section_types())
+    assert set(NODES) == set(section_types())
     for name in NODES:
-        assert node_class(name).component == component_of(name)[0]
+        assert node_class(name).component == name
 
 
 def test_a_graph_that_ended_leaves_no_socket(tmp_path):
