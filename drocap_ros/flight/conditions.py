@@ -102,7 +102,6 @@ class ConditionCode(enum.IntEnum):
     SUBJECT_UNCERTAIN = 202
     SUBJECT_NEAR = 203
     SUBJECT_FAR = 204
-    SUBJECT_AT_BORDER = 205
     NO_CAMERA_INFO = 206
     PICTURES_LOST = 207
     PICTURES_LATE = 208
@@ -241,8 +240,6 @@ _SENTENCES = {
     _C.SUBJECT_UNCERTAIN: "the subject's position is uncertain by {sd_m:.1f} m",
     _C.SUBJECT_NEAR: "the subject is {distance_m:.1f} m away, give or take {sd_m:.1f} m, and by the speeds of both the "
     "last {room_m:.1f} m may be lost until the vehicle stands: at the limit of {limit_m:g} m",
-    _C.SUBJECT_AT_BORDER: "the body leans, and the person is {margin_percent:.0f} % of the picture's height from the "
-    "border of the fixed camera's picture; a wider orbit, a wider lens or a gimbal keeps them inside",
     _C.SUBJECT_FAR: "the subject is {distance_m:.1f} m away: farther than {limit_m:g} m",
 }
 
