@@ -97,7 +97,6 @@ NODES: dict[str, NodeEntry] = {
     "image_ingest": NodeEntry(("image/compressed", "camera_info"), source=True, live=True, niceness=5),
     "flight_simulator": NodeEntry(("image/compressed", "camera_info"), source=True),
     "pose_estimator": NodeEntry(("pose2d", "background"), ("image/compressed", "roi"), live=True),
-    "capture_simulator": NodeEntry(("pose2d", "camera_info"), source=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(
         ("pose3d/refined", "pose3d/latest", *_TF),

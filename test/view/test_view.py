@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from captured_flight import FLIGHT, captured_config
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
@@ -30,7 +31,6 @@ from drocap_ros.view.rerun_scene import Scene
 pytest.importorskip("rerun", reason="no Rerun viewer here: `make setup` brings it")
 
 ROOT = Path(__file__).resolve().parents[2]
-FLIGHT = ("capture_simulator", "initializer", "bundle_adjuster", "session_recorder")
 
 
 def command(*arguments):
@@ -147,11 +147,11 @@ def test_cameras_are_placed_near_their_true_positions():
 
 
 def test_a_session_is_drawn_as_the_live_graph_saw_it(tmp_path):
-    config = DrocapConfig().replace("capture_simulator", seconds=3.0, rate_hz=15.0, seed=3)
+    config = captured_config(tmp_path, 3.0)
     config = config.replace("bundle_adjuster", period_s=0.5)
     config = config.replace("session_recorder", session_dir=str(tmp_path / "session"))
     with bringup(config, FLIGHT) as graph:
-        graph.wait_finished("capture_simulator", timeout_s=60)
+        graph.wait_finished("session_player", timeout_s=60)
         graph.spin_for(2.0)
     done = view(tmp_path / "session", "--save", tmp_path / "session.rrd")
     assert done.returncode == 0, done.stderr
