@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import as_strided
 
 from drocap_ros.reconstruction.camera.path_model import KNOT, SHARED
 from drocap_ros.reconstruction.camera.path_residuals import PathResiduals, gradient, knots_of_frames
-from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
+from drocap_ros.reconstruction.common.engine import Equations, add_second_difference
 
 #: Added to the weight of every point's unknowns, which are about radians: a point without parallax has any depth.  It
 #: also holds the place of a path that nothing else holds, a little.
@@ -81,13 +81,7 @@ class PathEquations:
         band[1:, :, 0] += weights.change
         band[:-1, :, 0] += weights.keep**2 * weights.change
         band[:-1, :, KNOT] -= weights.keep * weights.change
-        if count > 2:
-            swing = weights.acceleration
-            for offset, factor in ((0, 1.0), (1, 4.0), (2, 1.0)):
-                band[offset : count - 2 + offset, :3, 0] += factor * swing
-            band[: count - 2, :3, KNOT] -= 2 * swing
-            band[1 : count - 1, :3, KNOT] -= 2 * swing
-            band[: count - 2, :3, 2 * KNOT] += swing
+        add_second_difference(weights.acceleration, *(band[:, :3, ahead * KNOT] for ahead in range(3)))
 
     def _eliminate(self) -> None:
         """Subtract what the points explain; pieces that begin at one knot have one dense block."""
@@ -131,13 +125,10 @@ class PathEquations:
         band = self.band.copy()
         # The mean over the axes does not depend on where north is.
         band[:, 0] += damping * np.repeat(band[:, 0].reshape(-1, 3).mean(axis=1), 3)
-        factor = band_factor(band)
-        if factor is None:
+        found = Equations(band, self.border, self.corner).step(self.right, self.right_shared)
+        if found is None:
             return None
-        y = forward(factor, np.concatenate([-self.right[:, None], self.border], axis=1))
-        corner = self.corner - y[:, 1:].T @ y[:, 1:]
-        shared = np.linalg.solve(corner, -self.right_shared - y[:, 1:].T @ y[:, 0])
-        knots = backward(factor, y[:, :1] - y[:, 1:] @ shared[:, None])[:, 0]
+        knots, shared = found
         reached = np.concatenate([knots, np.zeros(KNOT * self._couplings.reach)])
         near = reached[KNOT * self._couplings.first[:, None] + np.arange(self.band.shape[1])]
         inside = np.empty_like(self._points)

@@ -11,7 +11,7 @@ from drocap_ros.geometry.rotations import hat
 from drocap_ros.reconstruction.camera.path_equations import PathEquations
 from drocap_ros.reconstruction.camera.path_model import ATTITUDE_LATENCY, KNOT, MISALIGNMENT, POSITION_LATENCY, SHARED
 from drocap_ros.reconstruction.camera.path_residuals import PathResiduals
-from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
+from drocap_ros.reconstruction.common.engine import Covariances, Equations
 
 #: Knots of which the deviations after the best similarity are computed: each costs six columns of the inverse.
 _NODES = 24
@@ -40,22 +40,16 @@ class Posterior(NamedTuple):
 
 def posterior_of(r: PathResiduals) -> Posterior | None:
     """Covariances at the solution; None = not positive definite."""
-    equations = PathEquations(with_own_noise(r))
-    factor = band_factor(equations.band.copy())
-    if factor is None:
+    at_end = PathEquations(with_own_noise(r))
+    found = Covariances.of(Equations(at_end.band.copy(), at_end.border, at_end.corner))
+    if found is None:
         return None
-    y = forward(factor, equations.border)
-    try:
-        inverse = np.linalg.inv(np.linalg.cholesky(equations.corner - y.T @ y))
-    except np.linalg.LinAlgError:
-        return None
-    shared = inverse.T @ inverse
-    knots, beside = _blocks(factor)
-    lever = backward(factor, y).reshape(len(knots), KNOT, -1)
+    shared, (knots, beside) = found.shared, found.blocks(KNOT)
+    lever = found.lever.reshape(len(knots), KNOT, -1)
     total = _by_shared(r) - lever
     pose = knots + total @ shared @ np.swapaxes(total, 1, 2)
     mean = np.tile(np.eye(KNOT)[:, :3] / len(knots), (len(knots), 1))
-    with_place = backward(factor, forward(factor, mean)).reshape(*total.shape[:2], 3)
+    with_place = found.of_frames(mean).reshape(*total.shape[:2], 3)
     with_place += total @ shared @ total[:, :3].mean(axis=0).T
     place = with_place[:, :3].mean(axis=0)
     pose[:, :, :3] -= with_place
@@ -66,11 +60,11 @@ def posterior_of(r: PathResiduals) -> Posterior | None:
     steps = knots[1:] + knots[:-1] - beside - np.swapaxes(beside, 1, 2)
     fact = r.data.config.views_per_fact
     # Telemetry, whose misalignment is free, holds a path as a whole.
-    shape = None if r.weights.free[MISALIGNMENT].any() else np.sqrt(fact) * _shape(r, factor, total, shared)
+    shape = None if r.weights.free[MISALIGNMENT].any() else np.sqrt(fact) * _shape(r, found, total)
     return Posterior(fact * shared, fact * knots, fact * steps, fact * place, fact * pose, shape)
 
 
-def _shape(r: PathResiduals, factor: np.ndarray, total: np.ndarray, shared: np.ndarray) -> np.ndarray:
+def _shape(r: PathResiduals, found: Covariances, total: np.ndarray) -> np.ndarray:
     """(K, 2) standard deviations of position and rotation of the knots after the best similarity, by some of them."""
     frame = r.data.knots.frame
     some = np.unique(np.round(np.linspace(0, len(frame) - 1, _NODES)).astype(np.intp))
@@ -79,10 +73,10 @@ def _shape(r: PathResiduals, factor: np.ndarray, total: np.ndarray, shared: np.n
     for column, node in enumerate(some.tolist()):  # one by one: an hour has a wide inverse
         own = np.zeros((len(frame), KNOT, KNOT))
         own[node] = np.eye(KNOT)
-        inverse = backward(factor, forward(factor, own.reshape(-1, KNOT))).reshape(own.shape)
+        inverse = found.of_frames(own.reshape(-1, KNOT)).reshape(own.shape)
         covariance[:, KNOT * column : KNOT * (column + 1)] = inverse[some].reshape(columns, KNOT)
     by_shared = total[some].reshape(columns, -1)
-    covariance = covariance + by_shared @ shared @ by_shared.T
+    covariance = covariance + by_shared @ found.shared @ by_shared.T
     # Moving, turning and stretching the whole path, one column each, for every node's position and rotation.
     place = r.position[frame[some]]
     about = place - place.mean(axis=0)
@@ -114,39 +108,3 @@ def _by_shared(r: PathResiduals) -> np.ndarray:
     out[:, :3, POSITION_LATENCY] = r.velocity[frame]
     out[..., ~r.weights.free] = 0.0
     return out
-
-
-def _blocks(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K, 6, 6) diagonal blocks of the inverse of a band, and (K - 1, 6, 6) beside them, from its Cholesky factor.
-
-    Source: Takahashi, Fagan, Chin 1973, by blocks as wide as the band: only what the band couples is computed.
-    """
-    from scipy.linalg import solve_triangular
-
-    width, size = factor.shape
-    count = -(-size // width)
-    lower = np.zeros((count, width, 2 * width))
-    row = np.arange(width)
-    for i in range(width):  # element [d, c] of the factor couples column c with row c + d
-        columns = np.arange(i, size, width)
-        lower[np.arange(len(columns))[:, None], i, i + row] = factor[:, columns].T
-    if size % width:
-        fill = np.arange(size % width, width)
-        lower[-1, fill, fill] = 1.0
-    knots, beside = np.empty((count * width, KNOT)), np.empty((count * width, KNOT))
-    later = np.zeros((width, width))
-    for block in range(count - 1, -1, -1):
-        own, coupling = lower[block, :, :width].T, lower[block, :, width:].T
-        inverse = solve_triangular(own, np.eye(width), lower=True)
-        down = coupling @ inverse
-        off = -later @ down
-        here = inverse.T @ inverse - down.T @ off
-        here = 0.5 * (here + here.T)
-        for at in range(0, width, KNOT):
-            rows = slice(block * width + at, block * width + at + KNOT)
-            knots[rows] = here[at : at + KNOT, at : at + KNOT]
-            inside = at + KNOT < width
-            next_rows = here[at + KNOT : at + 2 * KNOT] if inside else off[:KNOT]
-            beside[rows] = next_rows[:, at : at + KNOT].T
-        later = here
-    return knots[:size].reshape(-1, KNOT, KNOT), beside[: size - KNOT].reshape(-1, KNOT, KNOT)

@@ -28,6 +28,7 @@ from drocap_ros.reconstruction.camera.path_model import (
     PathState,
     tangents,
 )
+from drocap_ros.reconstruction.common.engine import pull_second_difference, second_difference
 
 #: Squared residual, in standard deviations, at which a point has half its weight: three of them, as for joints.
 OUTLIER_SQUARE = 9.0
@@ -145,7 +146,7 @@ class PathResiduals:
         errors, given = self.state.errors, self.data.path.position[self.data.knots.frame]
         self.change = errors[1:] - self.weights.keep * errors[:-1]
         flown = given + errors[:, :3]
-        self.swing = flown[2:] - 2 * flown[1:-1] + flown[:-2]
+        self.swing = second_difference(flown)
 
     def moved(self, errors: np.ndarray, shared: np.ndarray, points: np.ndarray) -> PathResiduals:
         """Residuals of the same cost after a step."""
@@ -234,10 +235,7 @@ def gradient(r: PathResiduals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     drift = weights.change * r.change
     errors[1:] += drift
     errors[:-1] -= weights.keep * drift
-    swing = weights.acceleration * r.swing
-    errors[2:, :3] += swing
-    errors[1:-1, :3] -= 2 * swing
-    errors[:-2, :3] += swing
+    pull_second_difference(errors[:, :3], weights.acceleration * r.swing)
     shared = weights.shared @ state.shared
     shared[weights.free] += pull[:, KNOT:].sum(axis=0)
     return errors, shared, data.views.of_pieces(np.einsum("nk,nki->ni", r.weighted, r.by_point))

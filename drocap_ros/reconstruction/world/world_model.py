@@ -21,9 +21,10 @@ JOINTS = len(BODY_17)
 #: Bones whose total length is the unit: those without the feet.
 BONES = len(BODY_15.bones)
 SPAN_STD_M = SPAN_STD_MM / 1000.0
-#: Unknowns of one frame: position error (3), rotation error (3) of the camera, joints.
+#: Standard deviation (m) of the body's total bone length, which sets the unit: less than any other term feels.
+GAUGE_M = 0.0005
+#: Unknowns of one frame and camera: position error (3), rotation error (3).
 CAMERA = 6
-FRAME = CAMERA + 3 * JOINTS
 #: The unknowns of the whole recording, in this order.
 LENGTHS = slice(0, len(SPANS))
 FLOOR = LENGTHS.stop
@@ -32,10 +33,22 @@ MISALIGNMENT = slice(SCALE + 1, SCALE + 4)
 ATTITUDE_LATENCY = MISALIGNMENT.stop
 POSITION_LATENCY = ATTITUDE_LATENCY + 1
 GLOBALS = POSITION_LATENCY + 1
-#: Those of every camera; each further view of the same body has its own, behind ``GLOBALS``.
+#: Those of every camera; each further view of the same body has its own ones, behind ``GLOBALS``.
 OF_VIEW = slice(MISALIGNMENT.start, GLOBALS)
+OWN = OF_VIEW.stop - OF_VIEW.start
 #: The unknowns of a :class:`~drocap_ros.reconstruction.world.findings.Findings`.
 CALIBRATED = slice(SCALE, GLOBALS)
+
+
+def joint_columns(views: int) -> slice:
+    """Places of the joints among the unknowns of a frame: behind the errors of every view's camera."""
+    return slice(CAMERA * views, CAMERA * views + 3 * JOINTS)
+
+
+def shared_columns(view: int) -> np.ndarray:
+    """(GLOBALS,) places of the unknowns that a view has, in their order, among the shared ones."""
+    own = np.arange(OF_VIEW.start, GLOBALS) + OWN * view
+    return np.concatenate([np.arange(OF_VIEW.start), own])
 
 
 @dataclass(frozen=True)
@@ -144,6 +157,11 @@ class WorldInput:
         """Frames per second."""
         return self.telemetry.fps
 
+    @property
+    def views(self) -> tuple[WorldInput, ...]:
+        """The first view, which is this one, and the further ones."""
+        return (self, *self.further)
+
 
 @dataclass(frozen=True)
 class WorldState:
@@ -163,8 +181,19 @@ class WorldState:
         """The telemetry shifted by the latencies, without the other errors."""
         return telemetry.shifted(float(self.globals[ATTITUDE_LATENCY]), float(self.globals[POSITION_LATENCY]))
 
+    def of_view(self, number: int) -> WorldState:
+        """The point as one view has it."""
+        own = shared_columns(number)
+        return WorldState(self.joints, self.camera[:, CAMERA * number : CAMERA * (number + 1)], self.globals[own])
+
+    def with_views(self, further: int) -> WorldState:
+        """A point of one view with as many further ones, whose cameras stand where they were placed."""
+        errors = np.zeros((len(self.joints), CAMERA * further))
+        camera, shared = np.concatenate([self.camera, errors], axis=1), np.append(self.globals, np.zeros(OWN * further))
+        return WorldState(self.joints, camera, shared)
+
     def moved(self, frames: np.ndarray, shared: np.ndarray) -> WorldState:
-        """The point after a step of the frames' unknowns (F, FRAME) and of the shared ones (GLOBALS,)."""
+        """The point after a step of the frames' unknowns, as of :func:`joint_columns`, and of the shared ones."""
         cameras = self.camera.shape[1]
         joints = self.joints + frames[:, cameras:].reshape(self.joints.shape)
         return WorldState(joints, self.camera + frames[:, :cameras], self.globals + shared)
