@@ -7,7 +7,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.evidence import Evidence
+from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.skeleton import BODY_15, BODY_17, JointSet, body_set
 from drocap_ros.tracks import Tracks

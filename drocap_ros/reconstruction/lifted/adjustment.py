@@ -29,7 +29,7 @@ from drocap_ros.reconstruction.common.engine import (
     pull_second_difference,
     second_difference,
 )
-from drocap_ros.reconstruction.common.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
+from drocap_ros.reconstruction.common.poses import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
 from drocap_ros.skeleton import BODY_17, RIGID_BONES, indices
 
 _CHAIN = BODY_17.bones

@@ -24,7 +24,6 @@ from drocap_ros.reconstruction.world.even_capture import (
     capture_windows,
     even_capture,
 )
-from drocap_ros.reconstruction.world.findings import MEASURED, Findings
 from drocap_ros.reconstruction.world.telemetry_checks import (
     frozen,
     jump_m,
@@ -40,9 +39,11 @@ from drocap_ros.reconstruction.world.world_model import (
     CAMERA,
     GLOBALS,
     JOINTS,
+    MEASURED,
     MISALIGNMENT,
     POSITION_LATENCY,
     SCALE,
+    Findings,
     PlacedPoses,
     WorldConfig,
     WorldInput,

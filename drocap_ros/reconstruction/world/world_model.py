@@ -7,6 +7,7 @@ scale enters through the camera's position alone, and no term that prefers littl
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +15,50 @@ from drocap_ros.camera_path import CameraErrors, CameraPath
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, ShiftedPath
-from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.skeleton import BODY_15, BODY_17
+
+#: Relative standard deviation of the scale below which it counts as measured: half of that among people.
+MEASURED = 0.03
+#: Time (s) after which findings count a third: telemetry drifts, and errors of the poses do not average out.
+_MEMORY_S = 60.0
+
+
+class Findings(NamedTuple):
+    """Of the measurements alone: precision (6, 6) and vector (6,); zeros = nothing is known.
+
+    The unknowns are the logarithm of the scale, the misalignment (3) rad, the latencies of attitude and position s; of
+    points the latter five first, then the logarithm of the focal length.
+    """
+
+    precision: np.ndarray
+    vector: np.ndarray
+
+    @staticmethod
+    def unknown() -> Findings:
+        """Nothing is known."""
+        return Findings(np.zeros((6, 6)), np.zeros(6))
+
+    def later(self, found: Findings, share: float, passed_s: float) -> Findings:
+        """Findings ``passed_s`` later, with a share of those of a window: its frames that the next one has not."""
+        decay = float(np.exp(-passed_s / _MEMORY_S))
+        return Findings(
+            decay * (self.precision + share * found.precision), decay * (self.vector + share * found.vector)
+        )
+
+    def of_scale(self) -> Findings:
+        """What they tell of the scale alone, where the camera's reports have other errors than until now."""
+        rest = self.precision[1:, 0] @ np.linalg.pinv(self.precision[1:, 1:])
+        alone = Findings.unknown()
+        alone.precision[0, 0] = self.precision[0, 0] - rest @ self.precision[1:, 0]
+        alone.vector[0] = self.vector[0] - rest @ self.vector[1:]
+        return alone
+
+    def after(self, found: Findings, its_ns: np.ndarray, stamp_ns: np.ndarray) -> Findings:
+        """Findings before a window of ``stamp_ns``, with those of the window of ``its_ns`` that it has not itself."""
+        begin, end = int(its_ns[0]), int(its_ns[-1])
+        share = float(np.clip((int(stamp_ns[0]) - begin) / max(end - begin, 1), 0.0, 1.0))
+        return self.later(found, share, max(int(stamp_ns[-1]) - end, 0) * 1e-9)
+
 
 JOINTS = len(BODY_17)
 #: Bones whose total length is the unit: those without the feet.
@@ -36,7 +79,7 @@ GLOBALS = POSITION_LATENCY + 1
 #: Those of every camera; each further view of the same body has its own ones, behind ``GLOBALS``.
 OF_VIEW = slice(MISALIGNMENT.start, GLOBALS)
 OWN = OF_VIEW.stop - OF_VIEW.start
-#: The unknowns of a :class:`~drocap_ros.reconstruction.world.findings.Findings`.
+#: The unknowns of a :class:`~drocap_ros.reconstruction.world.world_model.Findings`.
 CALIBRATED = slice(SCALE, GLOBALS)
 
 

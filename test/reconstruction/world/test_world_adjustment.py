@@ -19,9 +19,8 @@ from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.world import refine
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
-from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
-from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world
+from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world, posterior
 from drocap_ros.reconstruction.world.world_model import (
     ATTITUDE_LATENCY,
     CAMERA,
