@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.joint_maps import SHOULDERS_OUTWARDS, TABLES, joint_map
-from drocap_ros.skeleton import BODY_15, BODY_19, LIMB_JOINTS, joint_set
+from drocap_ros.skeleton import BODY_15, BODY_19, LIMB_JOINTS, SHOULDERS_OUTWARDS, TABLES, joint_map, joint_set
 
 
 @pytest.mark.parametrize("name", sorted(TABLES))

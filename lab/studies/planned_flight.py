@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.evaluation.compare import world_errors
+from drocap_ros.evaluation.truth_files import load_mocap
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.orbit.planner import OrbitState, reference_position
 from drocap_ros.flight.orbit.view_plan import choose_view, fly_plan, reach_of
 from drocap_ros.flight.orbit_goal import Wish, goal_of
-from drocap_ros.mocap import load_mocap
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.live.view_forecast import ViewForecaster
 from drocap_ros.reconstruction.reconstruct import reconstruct

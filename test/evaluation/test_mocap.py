@@ -9,7 +9,7 @@ import pytest
 from walking import write_mocap
 
 from drocap_ros.errors import InputError
-from drocap_ros.mocap import load_mocap
+from drocap_ros.evaluation.truth_files import load_mocap
 from drocap_ros.skeleton import BODY_17
 from lab.studies.protocol import resample
 
