@@ -6,13 +6,14 @@ The joints follow the MoCap convention of Human3.6M: ``pelvis`` is the middle of
 (not the line of the shoulders), ``head`` the middle of the skull's upper half, ``rtoe`` and ``ltoe`` the tips of the
 big toes.
 
-Maps from the joint sets of public networks give ``BODY_15``, or ``BODY_19`` for networks that see toes and heels.  Each
-of their joints is a weighted mean of a network's joints.  Most are one joint; the pelvis is the middle of the hips where
-the network has none; ``neck`` and ``head`` are extrapolated along the line from the middle of the shoulders: in the
-MoCap convention the neck lies 135 mm and the head 232 mm above it, the ears about 190 mm.  Extrapolated joints have an
-extra variance for the lean of the head, in units of the network's own shoulder-to-ear or neck-to-crown distance, and
-less confidence.  Networks that learned from COCO's annotations draw shoulders inside the joints' centres: they are moved
-outwards along the line between them, and get an extra variance for the share that the measure leaves open.
+Maps from the joint sets of public networks give ``BODY_15``, or ``BODY_19`` for networks that see toes and heels.
+Each of their joints is a weighted mean of a network's joints.  Most are one joint; the pelvis is the middle of the
+hips where the network has none; ``neck`` and ``head`` are extrapolated along the line from the middle of the
+shoulders: in the MoCap convention the neck lies 135 mm and the head 232 mm above it, the ears about 190 mm.
+Extrapolated joints have an extra variance for the lean of the head, in units of the network's own shoulder-to-ear or
+neck-to-crown distance, and less confidence.  Networks that learned from COCO's annotations draw shoulders inside the
+joints' centres: they are moved outwards along the line between them, and get an extra variance for the share that the
+measure leaves open.
 """
 
 from __future__ import annotations
