@@ -9,7 +9,6 @@ telemetry    the motion in the world by telemetry that errs (`python -m lab worl
              accuracy_telemetry
 together     two cameras 120 degrees apart whose times and places nobody knows (`drocap reconstruct A B --together`),
              every third sequence: page accuracy_together
-planned      flights by a plan against steady orbits of equal length: page accuracy_planned
 real         phone videos with optical MoCap (``--models DIR`` of the 2D networks): page accuracy_real
 calibration  gimbal yaw and latency found from telemetry that errs, an orbit that reverses once, `--runs` flights: page
              accuracy_calibration
@@ -42,8 +41,6 @@ from lab.studies.calibration import calibration_markdown, calibration_study
 from lab.studies.live_study import live_study
 from lab.studies.live_study_table import live_markdown
 from lab.studies.live_world import live_world_markdown, live_world_study
-from lab.studies.planned_flight import SECONDS as PLANNED_S
-from lab.studies.planned_flight import planned_markdown, planned_study
 from lab.studies.protocol import (
     FPS,
     IMAGE_SIZE,
@@ -190,14 +187,6 @@ def together(args: argparse.Namespace) -> None:
     write_figures("accuracy_together", "One body in the views of two cameras", "\n".join(pages))
 
 
-def planned(args: argparse.Namespace) -> None:
-    """Planned flights against steady orbits of equal length."""
-    with progress_bars() as progress:
-        rows = planned_study(args.mocap, args.limit, progress)
-    text = f"Flights of {PLANNED_S:g} s that begin at the same place, exact telemetry, one seed a sequence.\n\n"
-    write_figures("accuracy_planned", "Planned flights", text + planned_markdown(rows))
-
-
 def real(args: argparse.Namespace) -> None:
     """Phone videos with optical MoCap: by keypoints alone, and with feet and depth by a second network."""
     models = args.models or ROOT.parent / "shared" / "models"
@@ -221,7 +210,6 @@ PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective,
     "world": world, "telemetry": telemetry, "together": together, "calibration": calibration,
     "real": real,
-    "planned": planned,
 }  # fmt: skip
 
 

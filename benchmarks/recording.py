@@ -165,16 +165,17 @@ def part_kills(args: argparse.Namespace, folder: Path) -> None:
 
 
 def part_live(args: argparse.Namespace, folder: Path) -> None:
+    from captured_flight import captured_config
+
     from drocap_ros.bringup import bringup
-    from drocap_ros.config import DrocapConfig
     from drocap_ros.live_replay import reconstruct_live, recorded_config
     from drocap_ros.recording.open_session import open_session
 
-    config = DrocapConfig().replace("capture_simulator", seconds=args.flight)
+    config = captured_config(folder, args.flight, rate_hz=30.0)
     config = config.replace("session_recorder", session_dir=str(folder / "session"))
-    nodes = ["capture_simulator", "initializer", "bundle_adjuster", "session_recorder"]
+    nodes = ["session_player", "initializer", "bundle_adjuster", "session_recorder"]
     with bringup(config, nodes, processes=True) as graph:
-        graph.wait_finished("capture_simulator", timeout_s=5 * args.flight + 60)
+        graph.wait_finished("session_player", timeout_s=5 * args.flight + 60)
     with open_session(folder / "session") as session:
         motion, _, agreement = reconstruct_live(session, recorded_config(session) or config)
     initial, windows = agreement.initial, agreement.windows

@@ -51,37 +51,17 @@ BUDGETS = {
     # a live path takes over metres and up of later windows (0.08); deviations of a path about the best similarity
     # (0.06), and the person goes on from a path to the next one (0.05);
     # lean by balance (0.13)
-    ("flight",): 9.69,  # 3.89 over the plan: an argument or constant a line, with reasons; filter of reports, preflight
-    # and its look through the camera (0.05), who else is heard (0.02); ranges by the way about one who stands (0.07);
-    # pictures wait for the camera's attitude, a trunk counts alone (0.03); a height that errs (0.02);
-    # a plan's wishes, judged as an operator's (0.08), the view that it chooses (0.17);
-    # a process that holds after the bridge's death (0.24), nothing late, nothing into
-    # the pilot's mode, whatever asks it to end (0.06)
-    # a hold on the way out and a retreat end at the fence (0.02)
+    ("flight",): 9.35,  # a process that holds after the bridge's death; conditions with their values; preflight
     ("recording",): 5.70,  # 1.16 over the plan: every format of telemetry stayed; keypoints of other tools came (0.38)
     # and 3D poses of theirs (0.11); subtitles beside a video, units of flight logs (0.04);
     # bags without an index (0.12); points as the live graph had them (0.04);
     # topics of persons beside the subject (0.01)
-    ("simulation",): 3.59,  # 0.39 over the plan: reports err as recorded ones; one encoder a message; a port to share
+    ("simulation",): 3.55,  # reports err as recorded ones
     ("evaluation",): 1.0,  # truth from C3D, TRC and BVH by the names of other programs (0.34)
-    ("export", "report", "view"): 4.80,  # 1.45 over the plan: exports for OpenSim, persons, the viewer stayed; points;
-    # bones and floor of the OpenSim model (0.05); angles and speeds (0.13), kept images (0.07) of the report;
-    # the video beside the body in 3D, H.264 (0.33), the overlay of `track` (0.05, from cli); several persons in
-    # one report (0.17); images read while the motion is computed (0.05), or kept while it is tracked (0.05)
-    ("ros", "nodes", "bringup"): 5.00,  # 0.92 over the plan: lockstep and processes stayed; one argument a line;
-    # `odom`; nodes and topics of persons beside the subject (0.21); forecast of views (0.05)
-    # in simulated time the middleware carries only what somebody hears (0.02), and rendering, 2D poses and
-    # adjustments have processes of their own (0.18)
-    ("cli",): 4.90,  # 1.65 over the plan: batch, preflight and top stayed whole; one argument a line; cases of `world`;
-    # `sample` (0.05), a look through the camera (0.04), completion and proposals (0.04), images found (0.02),
-    # `evaluate table` (0.04), threads and one bar (0.05), several recordings together (0.15), several persons
-    # (0.14), picture of a plan (0.20)
-    ("lab", "benchmarks"): 11.30,  # 0.86 over the plan: studies and replay of reports; hours of healthy flight (0.08);
-    # near cameras and simulated evidence (0.14); what a lab may choose about one who walks (0.05); damaged files of
-    # every reader (0.15); two cameras (0.10), of unlike flights (0.02); peers on the same clip (0.10);
-    # several persons (0.12); deaths of the bridge and of its computer (0.03); people's shoulders and phones in the
-    # training (0.06), planned flights (0.20), real people (0.09)
-    # a subject who drives the vehicle out (0.01); the camera against COLMAP's (0.16); products of integers (0.05)
+    ("export", "report", "view"): 4.40,  # exports for OpenSim, a report of several persons, the video beside the body
+    ("ros", "nodes", "bringup"): 4.65,  # lockstep and processes of their own
+    ("cli",): 4.65,  # batch, preflight and top stayed whole
+    ("lab", "benchmarks"): 11.10,  # studies, replay of reports, faults of flights, damaged files of every reader
 }  # fmt: skip
 #: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.
 AUTOPILOT_WORD = re.compile(

@@ -24,18 +24,19 @@ from drocap_ros.reconstruction.live.picture_odometry import (
     camera_there,
     own_covariance,
 )
-from drocap_ros.reconstruction.live.view_forecast import facing_deg
 from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Window
 from drocap_ros.reconstruction.live.world_chain import WorldChain
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import place_in_world
 from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.reconstruction.world.world_model import config_of, world_config
+from drocap_ros.skeleton import BODY_17, indices
 
 #: Time (s) at a window's end in which the person's place there is compared with that in another one.
 _NEWEST_S = 1.5
 #: Time (s) in which a person's speed is forgotten: that of people who walk and stand is to 0.4 the same after 2.5 s.
 _SPEED_S = 3.0
+_SIDES = indices(BODY_17.joints, ("rhip", "lhip", "rshoulder", "lshoulder"))
 
 
 class PictureWindows:
@@ -139,9 +140,20 @@ def _onward(
         newest = last.stamp_ns >= last.stamp_ns[-1] - round(_NEWEST_S * 1e9)
         oldest = ours.stamp_ns <= ours.stamp_ns[0] + round(_NEWEST_S * 1e9)
         seen = seen_from_camera(ours, same.poses, same.metres_per_px(ours)) @ rotation
-        yaw = np.deg2rad(facing_deg(last.joints3d[newest], 1.0)[0] - facing_deg(seen[oldest][::-1], 1.0)[0])
+        yaw = np.deg2rad(_facing_deg(last.joints3d[newest]) - _facing_deg(seen[oldest][::-1]))
     about = exp_so3(np.array([0.0, 0.0, yaw]))
     return about, (both.position - position[both.image] @ about.T).mean(axis=0) * [1.0, 1.0, 0.0]
+
+
+def _facing_deg(body: np.ndarray) -> float:
+    """Where the left sides of hips and shoulders of poses (F, 17, 3) point at last, deg.
+
+    By a straight line through all poses: one who moves his arms twists his trunk to and fro.
+    """
+    sides = body[:, _SIDES, :2]
+    across = sides[:, [1, 3]].sum(axis=1) - sides[:, [0, 2]].sum(axis=1)
+    angle = np.degrees(np.unwrap(np.arctan2(across[:, 1], across[:, 0])))
+    return float(np.polyfit(np.arange(len(angle)) - len(angle) + 1.0, angle, 1)[1])
 
 
 def _beside(last: AdjustedWindow, placed: AdjustedWindow) -> np.ndarray:
