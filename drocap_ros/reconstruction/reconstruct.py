@@ -71,7 +71,7 @@ def reconstruct(
 
     Parameters
     ----------
-    tracks : joints by the names of BODY_17 or of a set in :mod:`drocap_ros.joint_maps`, COCO for one; the model
+    tracks : joints by the names of BODY_17 or of a set in :mod:`drocap_ros.skeleton`, COCO for one; the model
         estimates missing ones, others are ignored
     method : a name in :data:`~drocap_ros.reconstruction.methods.METHODS`
     progress : called with a stage and its fraction done
