@@ -86,13 +86,16 @@ site: $(SITE)/.ready  ## documentation site in build/site; its generator has an 
 release: setup  ## wheels without and with ROS in dist/, each tried in an empty environment
 	@$(CLEAN) bash .ci/release
 
-bench: setup  ## benchmarks (about an hour); each writes its page of docs/figures
+bench: demo  ## benchmarks (about two hours); they renew every page of docs/figures but those of flights
 	$(BENCHMARK)/demo.py
 	$(BENCHMARK)/accuracy.py
+	$(BENCHMARK)/body.py
+	$(BENCHMARK)/batch.py --recordings 200
+	$(BENCHMARK)/export.py demo_out
 	$(BENCHMARK)/reconstruction.py
 	$(BENCHMARK)/perception.py
-	$(BENCHMARK)/peers.py
-	$(BENCHMARK)/recording.py --seconds 120 --flight 60
+	$(BENCHMARK)/perception_people.py
+	$(BENCHMARK)/recording.py --seconds 120 --kills 200 --mutations 1000 --flight 60
 	$(BENCHMARK)/live.py
 
 bench-quick: export DROCAP_FIGURES := $(CURDIR)/build/figures
@@ -101,7 +104,7 @@ bench-quick: setup  ## the same benchmarks, short (about ten minutes); pages in 
 	$(BENCHMARK)/accuracy.py --limit 1
 	$(BENCHMARK)/reconstruction.py --frames 30 300 --threads 1 --repeat 1
 	$(BENCHMARK)/perception.py --quick
-	$(BENCHMARK)/recording.py --seconds 10 --kills 2 --mutations 20 --minutes 2 --flight 10
+	$(BENCHMARK)/recording.py --seconds 10 --kills 2 --mutations 20 --flight 10
 	$(BENCHMARK)/live.py load kills --seconds 15 --rounds 1
 
 bench-flight: setup  ## simulated faults, orbits by keypoints and by images, fuzzing (hours)

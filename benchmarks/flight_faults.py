@@ -1,6 +1,4 @@
-"""Table of faults in flight, for both dialects: `python benchmarks/flight_faults.py [--planned] [--seeds N] [WORDS]`.
-
-`--planned`: orbits by a plan whose wishes are drawn, as in `flight_orbits.py --planned`; only faults in an orbit.
+"""Table of faults in flight, for both dialects: `python benchmarks/flight_faults.py [--seeds N] [WORDS]`.
 
 `python benchmarks/flight_faults.py processes` flies the real `mavlink_bridge` process in real time instead, and kills
 and stops it and its perception.
@@ -9,18 +7,12 @@ and stops it and its perception.
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
-import numpy as np
 from figures import table, write_figures
 
-from drocap_ros.flight.orbit.states import State
-from drocap_ros.flight.orbit_config import ACCURACY
-from drocap_ros.flight.orbit_goal import Wish
 from lab.flights.branches import over_processes
 from lab.flights.fault_flight import (
     EXCURSION_M,
-    FAULT_S,
     MOTION_S,
     Fault,
     FaultResult,
@@ -29,28 +21,10 @@ from lab.flights.fault_flight import (
     within_protocol,
 )
 from lab.flights.fault_table import FAULTS
-from lab.flights.orbit_loop import OrbitLoop, with_config
 
 HEAD = [
     "", "dialect", "fault", "motion, s", "bound, s", "away, m", "bound, m", "speed, m/s", "state", "cause or condition",
 ]  # fmt: skip
-
-
-def wish(loop: OrbitLoop) -> None:
-    """Worse than any plan: anywhere, at heights beyond the limits too; it lasts until the flight is judged."""
-    chance = np.random.default_rng([loop.settings.seed, round(loop.t)])
-    drawn = Wish(chance.uniform(-4.0, 4.0), chance.uniform(-2.0, 25.0), loop.t + 2 * FAULT_S, "drawn")
-    loop.controller.on_wish(drawn)
-
-
-def planned(fault: Fault) -> Fault:
-    """The same fault in an orbit by a plan, with a wish a second until it occurs."""
-    wishes = [(float(at_s), wish) for at_s in range(1, int(FAULT_S))]
-    return replace(
-        fault,
-        change=lambda settings: with_config(fault.change(settings), plan=ACCURACY),
-        before=tuple(sorted([*fault.before, *wishes], key=lambda act: act[0])),
-    )
 
 
 def row(fault: Fault, autopilot: str, result: FaultResult) -> list[str]:
@@ -76,10 +50,10 @@ def row(fault: Fault, autopilot: str, result: FaultResult) -> list[str]:
     ]  # fmt: skip
 
 
-def flown(case: tuple[str, int, int, bool]) -> list[str]:
-    """Cells of the worst flight of a case: its dialect, its number in the table, how many flights, whether planned."""
-    autopilot, number, seeds, by_plan = case
-    fault = planned(FAULTS[number]) if by_plan else FAULTS[number]
+def flown(case: tuple[str, int, int]) -> list[str]:
+    """Cells of the worst flight of a case: its dialect, its number in the table, how many flights."""
+    autopilot, number, seeds = case
+    fault = FAULTS[number]
     try:
         results = [fly_fault(fault, autopilot, 4 + i) for i in range(seeds)]
     except AssertionError as error:  # the flight did not come to where the fault begins
@@ -92,7 +66,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*", help="only cases whose names hold one of these; or `processes`")
     parser.add_argument("--seeds", type=int, default=1, help="flights of each case; the worst is printed")
-    parser.add_argument("--planned", action="store_true", help="orbits by a plan with drawn wishes")
     parser.add_argument("--part", default="1/1", metavar="I/N", help="only the I-th of N parts of the cases")
     parser.add_argument("--autopilot", choices=("ardupilot", "px4"))
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
@@ -102,12 +75,11 @@ def main() -> int:
 
         return fly_processes()
     worst: list[list[str]] = []
-    faults = [number for number, fault in enumerate(FAULTS) if not args.planned or fault.state == State.ORBITING]
     part, parts = (int(number) for number in args.part.split("/"))
     cases = [
-        (autopilot, number, args.seeds, args.planned)
+        (autopilot, number, args.seeds)
         for autopilot in ((args.autopilot,) if args.autopilot else ("ardupilot", "px4"))
-        for number in faults[part - 1 :: parts]
+        for number in range(part - 1, len(FAULTS), parts)
         if not args.words or any(word in FAULTS[number].name for word in args.words)
     ]
     for cells in over_processes(flown, cases, args.jobs):
@@ -120,13 +92,8 @@ def main() -> int:
         f" harmless (h), {counts['-']} not kept (-)."
     )
     print(summary)
-    if len(worst) == 2 * len(faults):  # a selection of cases must not replace the page
-        page = (
-            ("flight_faults_planned", "Faults in planned flight")
-            if args.planned
-            else ("flight_faults", "Faults in flight")
-        )
-        write_figures(*page, f"{summary}\n\n{table(HEAD, worst)}")
+    if len(worst) == 2 * len(FAULTS):  # a selection of cases must not replace the page
+        write_figures("flight_faults", "Faults in flight", f"{summary}\n\n{table(HEAD, worst)}")
     return 1 if counts["-"] else 0
 
 

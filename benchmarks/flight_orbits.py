@@ -1,7 +1,6 @@
 """Orbits in closed loop: randomized ones, which must keep every limit, and the quality of the protocol's orbit.
 
     python benchmarks/flight_orbits.py [--jobs 2]           the 1000 randomized orbits, those not flown yet
-    python benchmarks/flight_orbits.py --planned            the same by a plan, with drawn wishes
     python benchmarks/flight_orbits.py --first 100 --count 50
     python benchmarks/flight_orbits.py table                summary of the orbits flown
     python benchmarks/flight_orbits.py quality              errors of radius, yaw and framing
@@ -31,15 +30,12 @@ from perception_errors import PerceptionErrors
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.orbit.states import Command, State
-from drocap_ros.flight.orbit_config import ACCURACY, STEADY
-from drocap_ros.flight.orbit_goal import Wish
 from lab.flights.branches import over_processes
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 
 SECONDS = 24.0
 SETTLE_S = 4.0
 RETRY_S = 3.0
-PLANNED = 10**6  # seeds from here on: the orbits of the seeds from 0 on by plans whose wishes are drawn
 RESULTS = Path(__file__).parent / "results" / "flight_orbits.jsonl"
 _SOURCES = Path(__file__).parents[1] / "drocap_ros"
 
@@ -84,19 +80,15 @@ def settings_of(seed: int) -> LoopSettings:
 
 def fly(seed: int) -> tuple[LoopSettings, OrbitLoop]:
     """Fly one; the operator starts at ``SETTLE_S`` and tries again whenever it did not go on for ``RETRY_S``."""
-    planned, seed = divmod(seed, PLANNED)
     errors = PerceptionErrors.drawn(seed)
-    settings = with_config(settings_of(seed), plan=ACCURACY if planned else STEADY)
+    settings = settings_of(seed)
     loop = OrbitLoop(errors.settings(settings))
     loop.down.loss = loop.up.loss = float(np.random.default_rng(seed + 10**6).choice([0.0, 0.0, 0.05]))
     loop.start(SETTLE_S)
     errors.disturb(loop)
-    waits_since, chance = [SETTLE_S], np.random.default_rng([seed, PLANNED])
+    waits_since = [SETTLE_S]
 
     def operate(loop: OrbitLoop) -> None:
-        if chance.random() < 0.05:  # once a second, worse than any plan: anywhere, at heights beyond the limits too
-            wish = Wish(chance.uniform(-4.0, 4.0), chance.uniform(-2.0, 25.0), loop.t + chance.uniform(0, 6), "drawn")
-            loop.controller.on_wish(wish)
         if loop.controller.safety.state == State.ORBITING:
             waits_since[0] = loop.t
         elif loop.t - waits_since[0] > RETRY_S:
@@ -242,10 +234,7 @@ def table(first: int, count: int) -> int:
         lines += [[f"{title}: {reason}", number] for reason, number in counts.most_common()]
     for line in lines:
         print(*line, sep=": ")
-    page = (
-        ("flight_planned", "Randomized planned orbits") if first >= PLANNED else ("flight_orbits", "Randomized orbits")
-    )
-    write_figures(*page, markdown_table(["what", "count"], lines))
+    write_figures("flight_orbits", "Randomized orbits", markdown_table(["what", "count"], lines))
     return 1 if bad else 0
 
 
@@ -379,13 +368,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="?", default="randomized", choices=["randomized", "table", "quality", "busy"])
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--planned", action="store_true", help="randomized, table: orbits by a plan with drawn wishes")
     parser.add_argument("--count", type=int, help="number of seeds: 1000, quality 1")
     parser.add_argument("--again", action="store_true", help="fly recorded seeds again")
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
     parser.add_argument("--seconds", type=float, default=math.inf, help="no new orbit after this time")
     args = parser.parse_args()
-    args.first += PLANNED if args.planned else 0
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     if args.what == "quality":
         return quality(args.first, args.count or 1)

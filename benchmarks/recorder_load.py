@@ -17,7 +17,7 @@ def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
     import numpy as np
 
     from drocap_ros.msg import VehicleState
-    from drocap_ros.nodes.capture_simulator import observation_of
+    from drocap_ros.observation import PoseObservation
     from drocap_ros.perception.sources.image_files import encode_jpeg
     from drocap_ros.ros.conversions import header_at, pose2d_to_ros
     from drocap_ros.ros.topics import TOPICS
@@ -35,7 +35,13 @@ def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
         )
 
     def pose(i: int) -> Any:
-        return pose2d_to_ros(observation_of(tracks, i % len(tracks), time.time_ns()), "camera_optical")
+        i %= len(tracks)
+        seen = (tracks.keypoints[i], tracks.covariance[i], tracks.confidence[i])
+        keypoints, covariance, confidence = (values.astype(np.float32) for values in seen)
+        observation = PoseObservation(
+            time.time_ns(), 1, tracks.image_size, keypoints=keypoints, covariance=covariance, confidence=confidence
+        )
+        return pose2d_to_ros(observation, "camera_optical")
 
     def state(_: int) -> Any:
         return VehicleState(header=header_at(time.time_ns(), "map"), autopilot="px4", mode="OFFBOARD")

@@ -44,7 +44,7 @@ from drocap_ros.ros.processes import (
 )
 from drocap_ros.ros.rclpy_internals import node_executor
 from drocap_ros.ros.spin import spin
-from drocap_ros.ros.topics import NODES, section_of, with_people
+from drocap_ros.ros.topics import NODES
 
 
 @contextlib.contextmanager
@@ -63,7 +63,7 @@ def bringup(
     Parameters
     ----------
     config : parameters of every component
-    nodes : names out of ``ros.topics.NODES``; with ``pose_estimator.people`` those of further persons are added
+    nodes : names out of ``ros.topics.NODES``
     processes : one process each (True), or all in this one, a thread each: for small machines, tests and scripts; the
         nodes then share Python's lock
     namespace : of the topics that have no leading slash; TF too lies in it, unless it is the default one
@@ -80,7 +80,7 @@ def bringup(
     NodeError
         When the endpoints are not matched in time, or a node fails.
     """
-    names = with_people(nodes, config.pose_estimator.people)
+    names = [name for name in NODES if name in nodes]
     unknown = sorted(set(nodes) - set(NODES))
     if unknown or not names:
         raise InputError(f"nodes: expected some of {', '.join(NODES)}; got {', '.join(unknown) or 'none'}")
@@ -146,7 +146,7 @@ def lockstep(
     InputError, NodeError
         When a node refuses its parameters or fails.
     """
-    names = with_people(nodes, config.pose_estimator.people)
+    names = [name for name in NODES if name in nodes]
     overrides = [Parameter("use_sim_time", value=True), Parameter("graph_nodes", value=",".join(names))]
     with contextlib.ExitStack() as stack:
         domain_id = stack.enter_context(free_domain())
@@ -162,10 +162,9 @@ def lockstep(
         stack.callback(_close, components)
         for name in names:
             link = {"transport": transports[name]} if transports and name in transports else {}
-            own: Values = {"cli_args": ["--ros-args", *remaps(name)], "parameter_overrides": overrides}
-            components.append(node_class(name)(config.section(section_of(name)), **link, **place, **own))
+            components.append(node_class(name)(config.section(name), **link, **place, parameter_overrides=overrides))
         for component in components:
-            component.beside.update((other.entry, other) for other in components)
+            component.beside.update((other.component, other) for other in components)
         observer = Node("bringup", **place, parameter_overrides=overrides[:1])
         stack.callback(observer.destroy_node)
         graph = Lockstep(components, observer)
@@ -194,11 +193,11 @@ class _NodeThread:
 
         def make() -> ComponentNode:
             return node_class(name)(
-                config.section(section_of(name)),
+                config.section(name),
                 context=context,
                 namespace=namespace,
                 use_global_arguments=False,
-                cli_args=["--ros-args", *remaps(name, namespace)],
+                cli_args=remaps(namespace),
                 parameter_overrides=[
                     Parameter("graph_nodes", value=",".join(names)),
                     Parameter("graph_running", value=restarted),

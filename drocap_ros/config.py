@@ -23,7 +23,6 @@ from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.recording.mcap.session_config import SessionPlayerConfig, SessionRecorderConfig
-from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.view.visualizer_config import VisualizerConfig
 
@@ -40,7 +39,6 @@ class DrocapConfig:
     session_recorder: SessionRecorderConfig = field(default_factory=SessionRecorderConfig)
     session_player: SessionPlayerConfig = field(default_factory=SessionPlayerConfig)
     visualizer: VisualizerConfig = field(default_factory=VisualizerConfig)
-    capture_simulator: SimulationConfig = field(default_factory=SimulationConfig)
     flight_simulator: FlightSimulatorConfig = field(default_factory=FlightSimulatorConfig)
 
     def section(self, component: str) -> Parameters:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +9,6 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.skeleton import BODY_15, JointSet, in_body_order
 from drocap_ros.tracks import read_npz
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """MoCap of one take: ``x`` (F, P, 3) mm, world z up, joints of BODY_17, or of BODY_15 without known toes."""
-
-    name: str
-    x: np.ndarray
 
 
 def load_mocap(
@@ -60,14 +50,3 @@ def _named_joints(a: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str]]:
     if not np.isfinite(x).all():
         raise InputError("X, toes: expected finite millimetres, got NaN or infinity; fill the gaps in")
     return x, names
-
-
-def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
-    """``.npz`` files of a folder by name; ``include`` is a glob on the name without its ending."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of MoCap .npz files; no such folder")
-    files = sorted(path for path in folder.glob("*.npz") if fnmatchcase(path.stem, include))
-    if not files:
-        raise InputError(f"{folder}: expected MoCap files {include}.npz, found none; check the folder and the pattern")
-    return files

@@ -30,7 +30,7 @@ COUNTING = (
 #: Files that take longest begin, so that none of them ends alone.
 LONG = (
     "system/test_simulated_demo.py", "system/test_packaging.py", "lab/flights/test_pilot_wins.py",
-    "reconstruction/live/test_world_windows.py", "cli/batch/test_batch_command.py", "system/test_demo.py",
+    "reconstruction/live/test_world_windows.py", "cli/test_batch_command.py", "system/test_demo.py",
     "cli/test_preflight_command.py", "cli/test_live_cli.py",
 )  # fmt: skip
 #: Marker expressions of `make test`, and the group of files that each runs.

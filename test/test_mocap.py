@@ -9,9 +9,9 @@ import pytest
 from walking import write_mocap
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import resample
 from drocap_ros.mocap import load_mocap
 from drocap_ros.skeleton import BODY_17
+from lab.studies.protocol import resample
 
 
 def test_resampling_keeps_the_motion() -> None:

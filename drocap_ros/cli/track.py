@@ -7,6 +7,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from drocap_ros.cli.motion_output import add_all_option, people_of, save_people_tracks
 from drocap_ros.cli.options import (
     Subparsers,
     add_clip_options,
@@ -17,7 +18,6 @@ from drocap_ros.cli.options import (
     add_threads_option,
     clip_of,
 )
-from drocap_ros.cli.people import add_all_option, people_of, save_people_tracks
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Track, or find all persons, and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, default_folder, output_folder, refuse_inputs
     from drocap_ros.cli.models import ensure_networks
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.running import progress_bars
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import logging
 import re
+import warnings
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.evaluation.c3d_file import read_c3d
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.skeleton import BODY_17, LIMB_JOINTS, in_body_order, indices
 from drocap_ros.tracks import MAX_FRAMES
@@ -149,12 +150,37 @@ def _even_times(count: int, rate_hz: float) -> np.ndarray:
     return np.arange(count) / rate_hz
 
 
-def _of_c3d(path: Path) -> _Points:
-    """Without a statement millimetres, z up."""
-    found = read_c3d(path)
-    unit = found.unit if found.unit in _UNITS else "mm"
-    up = found.vertical if found.vertical.lstrip("-") in _TO_Z_UP else "Z"
-    return _Points(found.names, found.positions, _even_times(len(found.positions), found.rate_hz), unit, up)
+def _read_c3d(path: Path) -> _Points:
+    """By the package c3d (https://www.c3d.org/HTML); without a statement millimetres, z up."""
+    import c3d
+
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the library, about parameters that it misses
+        try:
+            reader = c3d.Reader(file)
+            reader.get_analog_transform = lambda: (1.0, 0.0)  # nobody asks, and of some files it cannot be read
+            texts = {
+                name: [str(text).strip() for text in np.atleast_1d(found.string_array)]
+                for name in ("UNITS", "Y_SCREEN", "LABELS", *(f"LABELS{i}" for i in range(2, 10)))
+                if (found := reader.get(f"POINT:{name}"))
+            }
+            frames = [points[:, :4] for _, points, _ in islice(reader.read_frames(), MAX_FRAMES)]
+        except Exception as error:  # noqa: BLE001  # the library raises whatever the damage leads to
+            raise InputError(f"expected a C3D file that can be read; {first_line(error) or 'it is damaged'}") from None
+    names = [name for key, labels in texts.items() if key.startswith("LABELS") for name in labels]
+    table = np.array(frames, dtype=np.float64).reshape(len(frames), -1, 4)[:, : len(names)]
+    if not table.size:
+        raise InputError("expected named points in the C3D file, found none; export it again")
+    table[table[..., 3] < 0] = np.nan
+    unit, up = ("".join(texts.get(name, [])[:1]) for name in ("UNITS", "Y_SCREEN"))
+    unit, up = unit.lower(), up.upper().lstrip("+")
+    return _Points(
+        names[: table.shape[1]],
+        table[..., :3],
+        _even_times(len(table), float(reader.point_rate)),
+        unit if unit in _UNITS else "mm",
+        up if up.lstrip("-") in _TO_Z_UP else "Z",
+    )
 
 
 def _read_trc(path: Path) -> _Points:
@@ -261,7 +287,7 @@ def _kinematics(bones: list[_Bone], values: np.ndarray) -> np.ndarray:
 
 
 _READERS: tuple[tuple[re.Pattern[bytes], Callable[[Path], _Points]], ...] = (
-    (re.compile(rb".\x50", re.DOTALL), _of_c3d),
+    (re.compile(rb".\x50", re.DOTALL), _read_c3d),
     (re.compile(rb"\s*HIERARCHY"), _read_bvh),
     (re.compile(rb"PathFileType"), _read_trc),
 )

@@ -36,8 +36,6 @@ class ConditionCode(enum.IntEnum):
     SLOWED = 17
     WIDENED = 18
     REQUEST_ENDED = 19
-    PLANNED = 20
-    UNPLANNED = 21
     # Commands that are refused for what they ask, or for the state in which they come
     UNKNOWN_COMMAND = 40
     COMMAND_OUTDATED = 41
@@ -56,7 +54,6 @@ class ConditionCode(enum.IntEnum):
     MODE_CHANGE_FORBIDDEN = 54
     PERSON_LEAVES_PICTURE = 55
     HOLD_MODE_PENDING = 56
-    PLAN_UNKNOWN = 57
     # Link, autopilot and vehicle
     COMMANDS_DISABLED = 100
     CLOCK_JUMPED = 101
@@ -105,7 +102,6 @@ class ConditionCode(enum.IntEnum):
     SUBJECT_UNCERTAIN = 202
     SUBJECT_NEAR = 203
     SUBJECT_FAR = 204
-    SUBJECT_AT_BORDER = 205
     NO_CAMERA_INFO = 206
     PICTURES_LOST = 207
     PICTURES_LATE = 208
@@ -153,8 +149,6 @@ _SENTENCES = {
     "flies on for {timeout_s:g} s, and the vehicle must stop within max_coast_m, {limit_m:g} m",
     _C.WIDENED: "{cause}, {radius_m:.1f} m away instead of {wanted_m:.1f}: {why}",
     _C.REQUEST_ENDED: "engage ended without an orbit: {cause}",
-    _C.PLANNED: "{cause}; by the plan at {speed_deg_s:+.0f} deg/s and {height_m:.1f} m high: {why}",
-    _C.UNPLANNED: "{cause}; steadily instead of by the plan: {why}",
     _C.UNKNOWN_COMMAND: "no command has the number {number}",
     _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old by the bridge's clock, and {limit_s:g} s is the limit; "
     "synchronize the clocks of the two computers",
@@ -180,7 +174,6 @@ _SENTENCES = {
     "leaves the picture of {camera} by {missing_percent:.0f} % of its height; {remedy}",
     _C.HOLD_MODE_PENDING: "the autopilot's hold mode has just been requested and is not reported yet; send engage when "
     "it is{by_hand}",
-    _C.PLAN_UNKNOWN: "plan: expected one of {plans}, got {plan!r}; choose one of them",
     _C.COMMANDS_DISABLED: "no motion: commands are disabled; set commands_enabled to true to allow it",
     _C.CLOCK_JUMPED: "our clock jumped by {jump_s:.1f} s",
     _C.POSITION_JUMPED: "the reported position jumped by {jump_m:.1f} m, which the reported velocity does not explain",
@@ -247,8 +240,6 @@ _SENTENCES = {
     _C.SUBJECT_UNCERTAIN: "the subject's position is uncertain by {sd_m:.1f} m",
     _C.SUBJECT_NEAR: "the subject is {distance_m:.1f} m away, give or take {sd_m:.1f} m, and by the speeds of both the "
     "last {room_m:.1f} m may be lost until the vehicle stands: at the limit of {limit_m:g} m",
-    _C.SUBJECT_AT_BORDER: "the body leans, and the person is {margin_percent:.0f} % of the picture's height from the "
-    "border of the fixed camera's picture; a wider orbit, a wider lens or a gimbal keeps them inside",
     _C.SUBJECT_FAR: "the subject is {distance_m:.1f} m away: farther than {limit_m:g} m",
 }
 

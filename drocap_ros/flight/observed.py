@@ -162,7 +162,6 @@ class Pictures:
     frozen : whether its keypoints are those of the one before, bit for bit
     calibrated : whether the camera's matrix is known, without which no subject is located
     camera_problem : why the camera's attitude is unknown
-    framing_margin : between the person and the border of a fixed camera's picture, as a share of its height
     """
 
     age_s: float = math.inf
@@ -170,7 +169,6 @@ class Pictures:
     frozen: bool = False
     calibrated: bool = True
     camera_problem: Condition | None = None
-    framing_margin: float = math.inf
 
 
 @dataclass(frozen=True)

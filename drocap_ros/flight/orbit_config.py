@@ -11,8 +11,6 @@ from drocap_ros.parameters import Parameters, param
 
 _ROOM_M = 0.5  # of an orbit from min_distance_m: the error of the flown radius
 LEAST_REVERSAL_S = 10.0  # a turn takes two ramps
-#: How height and angular speed are chosen: as asked, or by what lowers the joints' predicted covariance.
-STEADY, ACCURACY = PLANS = ("steady", "accuracy")
 
 
 @dataclass(frozen=True)
@@ -57,13 +55,6 @@ class OrbitConfig(Parameters):
         False,
         "whether the orbit begins against its direction and turns once, after 15 s, so that a reconstruction "
         "can calibrate the telemetry; reverse_every_s replaces it",
-    )
-
-    plan: str = param(
-        STEADY,
-        "height and angular speed of an orbit: steady (as asked) or accuracy (at most as fast as asked, chosen by what "
-        "lowers the joints' predicted covariance)",
-        choices=PLANS,
     )
 
     def __post_init__(self) -> None:

@@ -18,20 +18,6 @@ class OrbitGoal(NamedTuple):
     angular_speed_rad_s: float
 
 
-class Wish(NamedTuple):
-    """Where a plan wishes the vehicle on its orbit; it is judged as an operator who adjusts the orbit.
-
-    bearing_rad : from the subject, 0 = east, counter-clockwise from above
-    until_s : monotonic time from which on it is outdated
-    why : in words
-    """
-
-    bearing_rad: float
-    height_m: float
-    until_s: float
-    why: str
-
-
 def goal_of(
     config: OrbitConfig,
     radius_m: float = math.nan,

@@ -5,15 +5,13 @@ from __future__ import annotations
 import sys
 
 from drocap_ros.errors import InputError
-from drocap_ros.ros.processes import node_class, remaps
+from drocap_ros.ros.processes import node_class
 from drocap_ros.ros.spin import node_main
-from drocap_ros.ros.topics import NODES, component_of
+from drocap_ros.ros.topics import NODES
 
 
 def main(name: str) -> int:
     """Run the named node; returns the exit status."""
-    if component_of(name)[1]:
-        sys.argv += ["--ros-args", *remaps(name)]
     return node_main(node_class(name))
 
 

@@ -1,7 +1,7 @@
 """Node ``bundle_adjuster``: adjusts the last seconds of poses together.
 
-Subscribes ``pose2d``, ``pose3d/initial``, ``background``, ``vehicle/state``, ``camera_info`` and ``orbit/status``;
-publishes ``pose3d/refined`` (drocap_ros/Pose3DWindow), ``pose3d/views`` of a planned orbit, and for every image
+Subscribes ``pose2d``, ``pose3d/initial``, ``background``, ``vehicle/state``, and ``camera_info``; publishes
+``pose3d/refined`` (drocap_ros/Pose3DWindow), and for every image
 ``pose3d/latest`` (drocap_ros/Pose3D): its initial pose with the bone lengths of the last window, stage INITIAL until
 there is one.  With the camera's pose and a measured scale both are in ``map``, else in the camera's optical frame;
 ``/diagnostics`` says why.  Without telemetry windows are in ``odom``, by the path of fixed points on ``/tf``.
@@ -20,16 +20,14 @@ from std_msgs.msg import Header
 from drocap_ros.background import PointHistory
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory
-from drocap_ros.msg import BackgroundTracks, OrbitStatus, Pose2D, Pose3D
+from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
-from drocap_ros.reconstruction.live.view_forecast import ViewForecaster
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, EffortControl, TelemetryUse, Window
 from drocap_ros.recording.pose_messages import add_calibration, add_state, fixed_points_from_message, float_array
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
@@ -39,7 +37,6 @@ from drocap_ros.ros.conversions import (
     pose2d_from_ros,
     pose3d_from_ros,
     stamp_from_ros,
-    views_to_ros,
     window_to_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
@@ -101,18 +98,13 @@ class BundleAdjusterNode(ComponentNode):
         self._sequence = 0
         self._subject_in_view = True
         self._had_telemetry = False
-        self._views = ViewForecaster(Lifter.load(self.config.lifter or None))
-        self._planned = False  # whether a planned orbit is flown, which needs forecasts
         self._uncalibrated = ""  # why the images have no calibration
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
-        self._tf = self.output("/tf") if TFMessage is not None and not self.person else None
+        self._tf = self.output("/tf") if TFMessage is not None else None
         self.input("pose2d", self._on_pose2d)
         self.input("pose3d/initial", self._on_initial)
-        if not self.person:
-            self.input("background", self._on_background)
-            self.input("orbit/status", self._on_status)
-            self._forecasts = self.output("pose3d/views")
+        self.input("background", self._on_background)
         self.input("vehicle/state", partial(add_state, self._cameras))
         self.input("camera_info", partial(add_calibration, self._cameras))
 
@@ -145,10 +137,6 @@ class BundleAdjusterNode(ComponentNode):
     def _on_background(self, message: BackgroundTracks) -> None:
         self._points.add(stamp_from_ros(message.header.stamp), fixed_points_from_message(message))
 
-    def _on_status(self, message: OrbitStatus) -> None:
-        planned = message.condition in (OrbitStatus.CONDITION_PLANNED, OrbitStatus.CONDITION_UNPLANNED)
-        self._planned = planned or (self._planned and message.condition == OrbitStatus.CONDITION_DEGRADED)
-
     def _on_initial(self, message: Pose3D) -> None:
         pose3d_from_ros(message)
         self._on_pair(self._join.add_second(stamp_from_ros(message.header.stamp), message))
@@ -178,7 +166,6 @@ class BundleAdjusterNode(ComponentNode):
         if event.restarted:
             self._latest_pose.reset()
             self._latest_place.reset()
-            self._views.reset()
         self._take_solution(observation.stamp_ns)
         self._publish_latest(observation, initial, joints)
         if not due:
@@ -256,10 +243,6 @@ class BundleAdjusterNode(ComponentNode):
         self._refined.publish(
             window_to_ros(window, solved.header, solved.track_id, self._sequence, seconds, solved.known_ns)
         )
-        if self._planned and window.telemetry is TelemetryUse.USED:
-            views = self._views.forecast(window.stamp_ns, window.joints3d)
-            if views is not None:
-                self._forecasts.publish(views_to_ros(views, int(window.stamp_ns[-1])))
         if window.in_map is not None and window.in_map.path and self._tf is not None:
             self._tf.publish(TFMessage(transforms=[camera_transform(window, solved.header.frame_id)]))
         self._sequence += 1

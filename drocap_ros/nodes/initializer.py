@@ -34,7 +34,7 @@ class InitializerNode(ComponentNode):
     def _on_pose2d(self, message: Pose2D) -> None:
         observation = pose2d_from_ros(message)
         if not observation.has_subject:
-            self.report(OK if self.person else WARN, "no subject in view")
+            self.report(WARN, "no subject in view")
             return
         pose = self._initializer.push(observation)
         event = self._initializer.event

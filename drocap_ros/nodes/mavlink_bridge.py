@@ -1,6 +1,6 @@
 """Node ``mavlink_bridge``: the autopilot's telemetry on topics and TF, and the orbit of the subject.
 
-Subscribes ``pose2d``, ``camera_info``, ``pose3d/views`` (the forecast of a planned flight), and ``orbit/status``,
+Subscribes ``pose2d``, ``camera_info``, and ``orbit/status``,
 where a second bridge would appear; publishes ``vehicle/state`` (drocap_ros/VehicleState), TF ``map`` -> ``base_link``
 and ``map`` -> ``camera_optical``, and ``orbit/status`` (drocap_ros/OrbitStatus); serves ``orbit/command``
 (drocap_ros/OrbitCommand).
@@ -32,7 +32,7 @@ from drocap_ros.flight.orbit.states import Command, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.rivals import Rivals
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.msg import OrbitStatus, Pose2D, ViewForecast
+from drocap_ros.msg import OrbitStatus, Pose2D
 from drocap_ros.parameters import Values
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode, MessageInfo
 from drocap_ros.ros.conversions import (
@@ -42,7 +42,6 @@ from drocap_ros.ros.conversions import (
     stamp_from_ros,
     transform_to_ros,
     vehicle_state_to_ros,
-    views_from_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.rclpy_internals import AnswerKey, PolledService
@@ -85,7 +84,6 @@ class MavlinkBridgeNode(ComponentNode):
         self.input("camera_info", self._on_camera_info)
         self.input("pose2d", self._on_pose2d, with_info=True)
         self.input("orbit/status", self._on_status)
-        self.input("pose3d/views", self._on_views)
         self._rivals = Rivals(self.get_namespace())
         self.requests = PolledService(self, OrbitCommand, "orbit/command", RESULT_QOS)
         self._unanswered: list[tuple[OperatorCommand, OrbitCommand.Request, AnswerKey]] = []
@@ -175,7 +173,6 @@ class MavlinkBridgeNode(ComponentNode):
                 float(request.height_m),
                 float(request.angular_speed_deg_s),
                 stamp_from_ros(request.stamp),
-                str(request.plan),
             )
             self._unanswered.append((command, request, header))
             self.controller.command(command)
@@ -230,9 +227,6 @@ class MavlinkBridgeNode(ComponentNode):
 
     def _on_status(self, message: OrbitStatus) -> None:
         self._rivals.take_status(stamp_from_ros(message.header.stamp), self.now_s())
-
-    def _on_views(self, message: ViewForecast) -> None:
-        self.controller.on_views(views_from_ros(message), self.now_s())
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         matrix, size = np.array(message.k, dtype=float).reshape(3, 3), (message.width, message.height)

@@ -3,14 +3,12 @@
 Subscribes ``pose2d``, ``pose3d/initial``, ``pose3d/latest`` and ``vehicle/state``; publishes ``markers/keypoints``
 (visualization_msgs/ImageMarker), ``markers/initial``, ``markers/latest`` and ``markers/camera_path``
 (visualization_msgs/MarkerArray) and the joints of the newest pose on TF, those of the latest one where it is in
-``map``.  With ``human_topics`` it also publishes the subject, and those of ``person_2/...`` and ``person_3/...``, by
-REP 155, see :mod:`drocap_ros.ros.rep155`.
+``map``.  With ``human_topics`` it also publishes the subject by REP 155, see :mod:`drocap_ros.ros.rep155`.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
-from functools import partial
+from collections import deque
 
 import numpy as np
 from visualization_msgs.msg import MarkerArray
@@ -21,7 +19,7 @@ from drocap_ros.ros.conversions import MAP, pose3d_from_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.ros.rep155 import AVAILABLE, MISSING, HumanTopics, human_transforms, prefix_of
-from drocap_ros.ros.topics import PLACES, TFMessage
+from drocap_ros.ros.topics import TFMessage
 from drocap_ros.view.visualizer_config import RateLimit, VisualizerConfig
 
 #: Time after which a marker of an initial pose without a successor disappears.
@@ -49,8 +47,7 @@ class VisualizerNode(ComponentNode):
         self._pace = {stage: RateLimit(self.config.marker_rate_hz) for stage in ("initial", "latest")}
         self._path: deque[np.ndarray] = deque(maxlen=self.config.path_points)
         self._path_ns = -(10**18)
-        #: Last pose in ``map`` by the prefix of the person's topics.
-        self._placed_ns = defaultdict[str, int](lambda: -(10**18))
+        self._placed_ns = -(10**18)  # last pose in ``map``
         # REP 155's topics have no namespace.
         self._prefix = prefix_of(self.get_namespace(), self.config.frame_prefix)
         self._humans = HumanTopics(self, self._prefix) if self.config.human_topics and AVAILABLE else None
@@ -60,37 +57,29 @@ class VisualizerNode(ComponentNode):
         self.input("pose3d/initial", self._on_initial)
         self.input("pose3d/latest", self._on_latest)
         self.input("vehicle/state", self._on_state)
-        for person in (f"person_{place}/" for place in PLACES):
-            self.input(f"{person}pose2d", partial(self._show_human, f"{person}pose2d"))
-            for topic in ("pose3d/initial", "pose3d/latest"):
-                self.input(f"{person}{topic}", partial(self._show_frames, person, latest=topic == "pose3d/latest"))
 
     def _on_pose2d(self, message: Pose2D) -> None:
         self._keypoints.publish(keypoint_marker(message))
-        self._show_human("pose2d", message)
-
-    def _show_human(self, topic: str, message: Pose2D) -> None:
         if self._humans is not None:
-            self._humans.publish(topic, message)
+            self._humans.publish(message)
 
     def _on_initial(self, message: Pose3D) -> None:
         pose3d_from_ros(message)  # refuses a malformed pose even when it is not drawn
         if self._pace["initial"].due(stamp_from_ros(message.header.stamp)):
             self._initial.publish(pose_markers(message, INITIAL_LIFETIME_S))
-        self._show_frames("", message, latest=False)
+        self._show_frames(message, latest=False)
         self.count(Key.POSES)
         if self.config.human_topics and self._humans is None:
             self.report(WARN, f"drawing; {MISSING}")
         else:
             self.report(OK, "drawing")
 
-    def _show_frames(self, person: str, message: Pose3D, *, latest: bool) -> None:
-        """Publish a person's joints on TF: by the latest pose where that is in ``map``, else by the initial one."""
-        pose3d_from_ros(message)
+    def _show_frames(self, message: Pose3D, *, latest: bool) -> None:
+        """Publish the joints on TF: by the latest pose where that is in ``map``, else by the initial one."""
         stamp_ns, placed = stamp_from_ros(message.header.stamp), latest and message.header.frame_id == MAP
         if placed:
-            self._placed_ns[person] = stamp_ns
-        here = placed or (not latest and abs(stamp_ns - self._placed_ns[person]) > _PLACED_NS)
+            self._placed_ns = stamp_ns
+        here = placed or (not latest and abs(stamp_ns - self._placed_ns) > _PLACED_NS)
         if self._tf is None or not here:
             return
         human = human_transforms(message, self._prefix) if self.config.human_topics else []
@@ -101,7 +90,7 @@ class VisualizerNode(ComponentNode):
         pose3d_from_ros(message)
         if self._pace["latest"].due(stamp_from_ros(message.header.stamp)):
             self._latest.publish(pose_markers(message, LATEST_LIFETIME_S))
-        self._show_frames("", message, latest=True)
+        self._show_frames(message, latest=True)
 
     def _on_state(self, message: VehicleState) -> None:
         stamp_ns = stamp_from_ros(message.header.stamp)

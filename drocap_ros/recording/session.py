@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
@@ -43,11 +42,6 @@ class TopicInfo:
     name: str
     type_name: str
     count: int
-
-    @property
-    def of_another(self) -> bool:
-        """Whether it is of a person beside the subject, as ``/drocap/person_2/pose2d``."""
-        return re.search(r"/person_\d+/", self.name) is not None
 
 
 @dataclass(frozen=True)
@@ -115,9 +109,9 @@ class Session(ABC):
         return dataclasses.replace(self._info, warnings=tuple(self.warnings))
 
     def topics_of(self, *type_names: str) -> list[TopicInfo]:
-        """Topics of some types that have messages, those with most messages first, other persons' last."""
+        """Topics of some types that have messages, those with most messages first."""
         found = [topic for topic in self.info.topics if topic.type_name in type_names and topic.count]
-        return sorted(found, key=lambda topic: (topic.of_another, -topic.count, topic.name))
+        return sorted(found, key=lambda topic: (-topic.count, topic.name))
 
     def choose_topic(self, *type_names: str) -> TopicInfo:
         """The topic of some types with most messages."""
@@ -127,7 +121,7 @@ class Session(ABC):
             nothing = "no messages" if self.info.topics else "no topics"
             there = ", ".join(f"{t.name} ({t.type_name})" for t in self.info.topics if t.count) or nothing
             raise InputError(f"{self.path}: expected a topic of type {kinds}, found {there}; record one")
-        if sum(not topic.of_another for topic in found) > 1:
+        if len(found) > 1:
             self.warn(f"several topics of type {kinds}: {', '.join(t.name for t in found)}; took {found[0].name}")
         return found[0]
 

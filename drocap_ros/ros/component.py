@@ -77,11 +77,6 @@ class ComponentNode(Node):
     ) -> None:
         node_kwargs.setdefault("namespace", "/drocap")
         super().__init__(self.component, **node_kwargs)
-        name, own = topics.component_of(self.get_name())
-        #: Prefix of the topics of one person beside the subject: that of ``initializer_2`` is ``person_2/``.
-        self.person = own if name == self.component else ""
-        #: Name in the table of nodes.
-        self.entry = self.get_name() if self.person else self.component
         #: Whether ROS' parameter ``use_sim_time`` is set: every time is then that of ``/clock``, and no result depends
         #: on how fast this machine is.
         self.simulated = bool(self.get_parameter("use_sim_time").value)
@@ -90,8 +85,8 @@ class ComponentNode(Node):
         #: All nodes of the graph; empty without a bringup.
         self.peers: list[str] = [name for name in peers.split(",") if name]
         #: Nodes of the graph that one thread runs, by name: they read each other's parameters without a service.
-        self.beside: dict[str, ComponentNode] = {self.entry: self}
-        self.config = declare_parameters(self, config or section_types()[topics.section_of(self.component)]())
+        self.beside: dict[str, ComponentNode] = {self.component: self}
+        self.config = declare_parameters(self, config or section_types()[self.component]())
         self.transport = transport
         self.counters: Counter[str] = Counter()
         self._counting = threading.Lock()
@@ -154,7 +149,6 @@ class ComponentNode(Node):
 
     def output(self, topic: str) -> Publisher:
         """Publisher of a topic of the table."""
-        topic = topics.own_topic(self.person, topic)
         entry = TOPICS[topic]
         # The subscriber reports an incompatible quality of service itself.
         silent = PublisherEventCallbacks(use_default_callbacks=False)
@@ -176,7 +170,6 @@ class ComponentNode(Node):
 
         with_info : the callback's second argument is rclpy's message info
         """
-        topic = topics.own_topic(self.person, topic)
         entry = TOPICS[topic]
         take = self.guarded(topic, callback, stamps=entry.one_clock)
         if with_info:
@@ -311,7 +304,7 @@ class ComponentNode(Node):
         if self._clock_stands:
             return "use_sim_time is set, and /clock " + ("stands still" if self._clock_ns else "has not come yet")
         now_s = self.now_s()
-        for topic in (topics.own_topic(self.person, needed) for needed in self.needs):
+        for topic in self.needs:
             heard_s = self._heard_s.get(topic)
             silent_s = now_s - (self._begin_s if heard_s is None else heard_s)
             if silent_s > IDLE_S:
@@ -336,7 +329,7 @@ class ComponentNode(Node):
         message.status = [
             DiagnosticStatus(
                 level=level,
-                name=f"{self.get_namespace().strip('/')}/{self.entry}",
+                name=f"{self.get_namespace().strip('/')}/{self.component}",
                 message=text,
                 hardware_id=HARDWARE_ID,
                 values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],

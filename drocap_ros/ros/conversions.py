@@ -14,11 +14,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
 
 from drocap_ros.background import FixedPoints
-from drocap_ros.errors import InputError
-from drocap_ros.flight.orbit.view_plan import ViewForecast as ViewForecastData
 from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
 from drocap_ros.geometry.rotations import quaternion_from_matrix
-from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState, ViewForecast
+from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.reconstruction.live.latest_place import PlacedPose
@@ -210,28 +208,6 @@ def window_to_ros(
     )
 
 
-def views_to_ros(views: ViewForecastData, stamp_ns: int) -> ViewForecast:
-    """Forecast of the views by poses in ``map`` until this time -> message."""
-    return ViewForecast(
-        header=Header(stamp=stamp_to_ros(stamp_ns), frame_id=MAP),
-        turn_deg_s=views.turn_deg_s,
-        bearing_deg=floats(views.bearing_deg),
-        elevation_deg=floats(views.elevation_deg),
-        error_m=floats(views.error_m),
-    )
-
-
-def views_from_ros(message: ViewForecast) -> ViewForecastData:
-    """Message -> forecast of the views."""
-    count, names = len(message.error_m), ("bearing_deg", "elevation_deg", "error_m")
-    bearing, elevation, error = (float_array(getattr(message, name), (count,), name).astype(float) for name in names)
-    grid = len(np.unique(bearing)) * len(np.unique(elevation))
-    finite = np.isfinite([message.turn_deg_s, *bearing, *elevation, *error]).all()
-    if not (0 < count == grid and finite and (error > 0.0).all()):
-        raise InputError(f"error_m: expected finite errors above 0 m of a whole grid, got {count} of {grid} views")
-    return ViewForecastData(bearing, elevation, error, float(message.turn_deg_s))
-
-
 def camera_transform(window: AdjustedWindow, child: str) -> TransformStamped:
     """``odom`` -> optical frame, of the newest image of a window there."""
     assert window.in_map is not None
@@ -253,16 +229,14 @@ def orbit_request(
     radius_m: float = math.nan,
     height_m: float = math.nan,
     speed_deg_s: float = math.nan,
-    plan: str = "",
 ) -> OrbitCommand.Request:
-    """A command for ``mavlink_bridge``, stamped by the node's clock; NaN, "" = the configured or present value."""
+    """A command for ``mavlink_bridge``, stamped by the node's clock; NaN = the configured or present value."""
     return OrbitCommand.Request(
         stamp=node.get_clock().now().to_msg(),
         command=command,
         radius_m=radius_m,
         height_m=height_m,
         angular_speed_deg_s=speed_deg_s,
-        plan=plan,
     )
 
 

@@ -29,7 +29,6 @@ class Key:
     RATE = "rate_hz"
     LATENCY_P50, LATENCY_P95, LATENCY_P99 = "latency_p50_ms", "latency_p95_ms", "latency_p99_ms"
     SUBJECT = "subject"
-    FOLLOWED = "followed"  # ids of the persons beside the subject
     NETWORKS = "networks"
     LAST_REFUSED = "last_refused"
     PILOT, VEHICLE_MODE = "pilot", "vehicle_mode"

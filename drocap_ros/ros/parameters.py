@@ -18,7 +18,6 @@ from drocap_ros.config import section_types
 from drocap_ros.errors import ParameterError
 from drocap_ros.parameters import Parameters, Values
 from drocap_ros.ros.rclpy_internals import overridden_parameters
-from drocap_ros.ros.topics import section_of
 
 P = TypeVar("P", bound=Parameters)
 
@@ -51,7 +50,7 @@ def declare_parameters(node: Node, defaults: P) -> P:
 def parameter_help(component: str) -> str:
     """One line for each parameter of a component: name, default, unit, description."""
     lines = []
-    for spec in dataclasses.fields(section_types()[section_of(component)]):
+    for spec in dataclasses.fields(section_types()[component]):
         unit = f" {spec.metadata['unit']}" if spec.metadata.get("unit") else ""
         lines.append(f"  {spec.name} ({spec.default!r}{unit}): {spec.metadata['description']}")
     return "\n".join(lines)

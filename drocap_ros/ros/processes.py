@@ -21,7 +21,6 @@ from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.own_process import LEAN, environment
 from drocap_ros.ros.spin import node_main
-from drocap_ros.ros.topics import component_of, section_of
 
 #: TF has its usual place in this namespace only; another graph has its own, ``NAMESPACE/tf``, since the frames of two
 #: drones have the same names.
@@ -47,7 +46,7 @@ class LaunchContext:
         # The server of this Python process serves all its graphs; it has no thread besides those of LTTng, which its
         # forks do not need.
         solvers = ["scipy.linalg.lapack", "scipy.ndimage"] if "bundle_adjuster" in names else []
-        _FORKSERVER.set_forkserver_preload([*(f"drocap_ros.nodes.{component_of(name)[0]}" for name in names), *solvers])
+        _FORKSERVER.set_forkserver_preload([*(f"drocap_ros.nodes.{name}" for name in names), *solvers])
         path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
         resource_tracker.ensure_running()  # which unblocks the signal
         with environment({**LEAN, **os.environ, "PYTHONPATH": path}), _blocked(signal.SIGTERM):
@@ -56,7 +55,7 @@ class LaunchContext:
     def parameter_file(self, name: str, config: DrocapConfig, restarted: bool) -> Path:
         """Write a node's parameters."""
         path = self.folder / f"{name}.yaml"
-        section = config.to_parameter_file()[f"/**/{section_of(name)}"]["ros__parameters"]
+        section = config.to_parameter_file()[f"/**/{name}"]["ros__parameters"]
         values = {**section, "graph_nodes": ",".join(self.names), "graph_running": restarted}
         path.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}), encoding="utf-8")
         return path
@@ -69,7 +68,7 @@ class NodeProcess:
         self.name = name
         self._log = context.folder / f"{name}.log"
         parameters = str(context.parameter_file(name, config, restarted))
-        arguments = [*context.ros_arguments, *remaps(name, context.namespace), "--params-file", parameters]
+        arguments = [*context.ros_arguments, *remaps(context.namespace), "--params-file", parameters]
         variables = context.environment | fastdds.environment()
         # As a daemon it does not survive this process.
         self._process = _FORKSERVER.Process(
@@ -143,19 +142,17 @@ def _blocked(number: signal.Signals) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def remaps(name: str, namespace: str = DEFAULT_NAMESPACE) -> list[str]:
-    """ROS arguments that give a node its name and keep one graph's TF from another's."""
-    tf = [] if namespace == DEFAULT_NAMESPACE else ["-r", f"/tf:={namespace.rstrip('/')}/tf"]
-    return ["-r", f"__node:={name}", *tf]
+def remaps(namespace: str) -> list[str]:
+    """ROS arguments that keep one graph's TF from another's."""
+    return [] if namespace == DEFAULT_NAMESPACE else ["--ros-args", "-r", f"/tf:={namespace.rstrip('/')}/tf"]
 
 
 def node_class(name: str) -> type[ComponentNode]:
     """Class of a node by its name; only its module is imported."""
-    component, _ = component_of(name)
-    module = importlib.import_module(f"drocap_ros.nodes.{component}")
+    module = importlib.import_module(f"drocap_ros.nodes.{name}")
     found: type[ComponentNode] = next(
         value
         for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, ComponentNode) and value.__dict__.get("component") == component
+        if isinstance(value, type) and issubclass(value, ComponentNode) and value.__dict__.get("component") == name
     )
     return found

@@ -1,4 +1,4 @@
-"""The subject, and whoever is followed beside it, by REP 155: ``/humans/bodies`` topics and TF frames.
+"""The subject by REP 155: ``/humans/bodies`` topics and TF frames.
 
 The messages are those of ``hri_msgs`` 2; ``make setup`` builds the four of them, a ROS installation has the package
 ``ros-DISTRO-hri-msgs``.  Without them only the frames are published.
@@ -112,35 +112,37 @@ def region(observation: PoseObservation, header: Header) -> Message:
 
 
 class HumanTopics:
-    """Publishers of the tracked bodies, by the topics of their keypoints; destroyed when the track ends."""
+    """Publishers of the tracked body; those of its own are destroyed when the track ends."""
 
     def __init__(self, node: Node, frame_prefix: str = "") -> None:
         self._node, self._prefix = node, frame_prefix
         self._ids = node.create_publisher(hri.IdsList, f"{_BODIES}/tracked", _QOS)
         self._persons = node.create_publisher(hri.IdsList, f"{_PERSONS}/tracked", _QOS)
-        self._tracked: dict[str, tuple[str, Publisher, Publisher, Publisher]] = {}
+        self._tracked = ""
+        self._own: list[Publisher] = []
 
-    def publish(self, topic: str, message: Pose2D) -> None:
-        """Publish a body's box and keypoints, and the identifiers of all."""
+    def publish(self, message: Pose2D) -> None:
+        """Publish the body's box, keypoints and identifiers."""
         observation = pose2d_from_ros(message)
-        now = body_id(message.track_id, self._prefix) if observation.has_subject else ""
-        before, *old = self._tracked.get(topic, ("",))
-        if now != before:
-            for publisher in old:
-                self._node.destroy_publisher(publisher)
-            self._tracked.pop(topic, None)
-            if now:
-                self._tracked[topic] = (
-                    now,
-                    self._node.create_publisher(hri.Skeleton2D, f"{_BODIES}/{now}/skeleton2d", _QOS),
-                    self._node.create_publisher(hri.NormalizedRegionOfInterest2D, f"{_BODIES}/{now}/roi", _QOS),
-                    self._node.create_publisher(String, f"{_PERSONS}/{person_id(now)}/body_id", KEPT_QOS),
-                )
-                self._tracked[topic][-1].publish(String(data=now))
-        ids = [name for name, *_ in self._tracked.values()]
+        body = body_id(message.track_id, self._prefix) if observation.has_subject else ""
+        if body != self._tracked:
+            self._follow(body)
+        ids = [body] if body else []
         self._ids.publish(hri.IdsList(header=message.header, ids=ids))
         self._persons.publish(hri.IdsList(header=message.header, ids=[person_id(name) for name in ids]))
-        if now:
-            _, skeletons, regions, _ = self._tracked[topic]
+        if body:
+            skeletons, regions, _ = self._own
             skeletons.publish(skeleton2d(observation, message.header))
             regions.publish(region(observation, message.header))
+
+    def _follow(self, body: str) -> None:
+        for publisher in self._own:
+            self._node.destroy_publisher(publisher)
+        self._tracked, self._own = body, []
+        if body:
+            self._own = [
+                self._node.create_publisher(hri.Skeleton2D, f"{_BODIES}/{body}/skeleton2d", _QOS),
+                self._node.create_publisher(hri.NormalizedRegionOfInterest2D, f"{_BODIES}/{body}/roi", _QOS),
+                self._node.create_publisher(String, f"{_PERSONS}/{person_id(body)}/body_id", KEPT_QOS),
+            ]
+            self._own[-1].publish(String(data=body))

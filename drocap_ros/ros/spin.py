@@ -121,7 +121,7 @@ def node_main(node_class: type[ComponentNode]) -> int:
     try:
         # A restarted node keeps the usual priority until it is ready.
         node = node_class()
-        spin(node, executor, stop, partial(lower_priority, NODES[node.entry].niceness))
+        spin(node, executor, stop, partial(lower_priority, NODES[node.component].niceness))
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)
         return error.exit_status

@@ -30,4 +30,3 @@ class SimulationConfig(Parameters):
     seconds: float = param(20.0, "length of the simulated flight", unit="s", minimum=0.1, maximum=36000)
     rate_hz: float = param(30.0, "images per second", unit="Hz", minimum=1, maximum=240)
     seed: int = param(0, "seed of person, take and noise", minimum=0)
-    vehicle_url: str = param("", "MAVLink URL of the simulated vehicle; empty = no vehicle")

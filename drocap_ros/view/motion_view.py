@@ -12,7 +12,6 @@ from drocap_ros.skeleton import JointSet
 from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
 from drocap_ros.view.rerun_scene import Scene
 
-PLOTS = ("reprojection_px", "confidence")
 #: Images are shrunk to this: a minute of video then gives a file of about 150 MB.
 _LONG_SIDE = 960
 
@@ -53,7 +52,7 @@ def _draw_frames(
         scene.camera_path(known)
     for i, stamp_ns in enumerate(motion.stamp_ns):
         scene.at(int(stamp_ns))
-        scene.pose("refined", joints_of, joints[i])
+        scene.pose(joints_of, joints[i])
         scene.keypoints(joints_of, keypoints[i])
         if np.isfinite(positions[i]).all():
             scene.camera(positions[i], rotation[i])

@@ -61,8 +61,6 @@ def to_browser(
     host: str,
     port: int,
     memory_limit: str,
-    *,
-    newest_first: bool,
 ) -> Iterator[str]:
     """Serve the recording and a web viewer on two ports, ``port`` and the next, while the context lasts.
 
@@ -72,12 +70,10 @@ def to_browser(
     Parameters
     ----------
     host : address to serve on; 127.0.0.1 = this machine alone
-    newest_first : a page that is opened late starts with the newest data
     """
     _check_free(host, port, port + 1)
     command = [_program(), "--serve-web", "--bind", host, "--port", str(port + 1)]
     command += ["--web-viewer-port", str(port), "--server-memory-limit", memory_limit]
-    command += ["--newest-first"] if newest_first else []
     server = subprocess.Popen(
         command,
         stdout=subprocess.DEVNULL,

@@ -199,9 +199,9 @@ class OrbitLoop:
         """Stamp of a picture that is exposed now."""
         return self.clock_ns() + round(self.settings.stamp_late_s * 1e9)
 
-    def command(self, kind: Command, plan: str = "", **values: float) -> None:
+    def command(self, kind: Command, **values: float) -> None:
         """Send a command of the operator now."""
-        self.controller.command(OperatorCommand(int(kind), stamp_ns=self.clock_ns(), plan=plan, **values))
+        self.controller.command(OperatorCommand(int(kind), stamp_ns=self.clock_ns(), **values))
 
     def pelvis(self, t_s: float | None = None) -> np.ndarray:
         """(3,) m, truth; now, or at a time."""
@@ -220,11 +220,11 @@ class OrbitLoop:
         while self.t < until_s - 1e-9 and not self.copter.crashed:
             self._step(each)
 
-    def start(self, settle_s: float = 4.0, plan: str = "", **values: float) -> None:
+    def start(self, settle_s: float = 4.0, **values: float) -> None:
         """Let link and filter settle, then start the orbit; request control where the pilot has not given it."""
         self.run(self.t + settle_s)
         in_control = self.copter.mode == self.copter.kind.control_mode
-        self.command(Command.START if in_control else Command.ENGAGE, plan, **values)
+        self.command(Command.START if in_control else Command.ENGAGE, **values)
 
     def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:
         """Observation of the person now; here from the projections of the joints.

@@ -198,6 +198,6 @@ def help_text(capsys, *words):
 
 def test_every_listed_command_has_a_help_text(capsys):
     commands = set(re.findall(r"^    ([a-z][a-z-]+)", help_text(capsys), re.MULTILINE))
-    assert commands >= {"demo", "live", "record", "reconstruct", "info", "models", "learn-dictionary"}
+    assert commands >= {"demo", "live", "record", "reconstruct", "info", "models", "evaluate"}
     for command in commands:
         assert f"drocap {command}" in help_text(capsys, command)

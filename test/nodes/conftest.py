@@ -12,6 +12,6 @@ from drocap_ros.bringup import bringup
 def captured(tmp_path_factory):
     """Session of a simulated capture of four seconds; of the module, so that a repeated test flies it again."""
     folder = tmp_path_factory.mktemp("flight") / "session"
-    with bringup(flight_config(folder), FLIGHT, processes=True) as graph:
-        graph.wait_finished("capture_simulator", timeout_s=60)
+    with bringup(flight_config(folder, folder.parent), FLIGHT, processes=True) as graph:
+        graph.wait_finished("session_player", timeout_s=60)
     return folder

@@ -15,7 +15,6 @@ from drocap_ros.flight.frames import OPTICAL_FROM_FLU
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.live_replay import reconstruct_live, recorded_config
-from drocap_ros.msg import OrbitStatus
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording.open_session import open_session
@@ -27,7 +26,6 @@ from drocap_ros.ros.conversions import (
     pose3d_to_ros,
     stamp_from_ros,
     vehicle_state_to_ros,
-    views_from_ros,
 )
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import TOPICS
@@ -159,7 +157,7 @@ def orbited(tmp_path_factory):
     config = DrocapConfig().replace("session_recorder", session_dir=str(folder))
     # A busy machine takes its time here, instead of every fourth image.
     config = config.replace("bundle_adjuster", max_solve_s=5.0)
-    seen = {topic: [] for topic in ("pose3d/latest", "pose3d/refined", "pose3d/views", "/diagnostics")}
+    seen = {topic: [] for topic in ("pose3d/latest", "pose3d/refined", "/diagnostics")}
     width, height = flown.observations[0].image_size
     camera = CameraModel(width, height, flown.matrix)
     gimbal = quaternion_from_matrix(np.swapaxes(OPTICAL_FROM_FLU.T @ flown.rotation, 1, 2))
@@ -168,15 +166,13 @@ def orbited(tmp_path_factory):
             graph.node.create_subscription(TOPICS[topic].message, topic, messages.append, TOPICS[topic].qos)
         publishers = {
             topic: graph.node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
-            for topic in ("pose2d", "vehicle/state", "camera_info", "background", "orbit/status")
+            for topic in ("pose2d", "vehicle/state", "camera_info", "background")
         }
         graph.wait_until(
-            lambda: [p.get_subscription_count() for p in publishers.values()] == [3, 2, 2, 2, 2],
+            lambda: [p.get_subscription_count() for p in publishers.values()] == [3, 2, 2, 2],
             20,
             "the nodes to listen",
         )
-        planned = OrbitStatus(state=OrbitStatus.ORBITING, condition=OrbitStatus.CONDITION_PLANNED)
-        publishers["orbit/status"].publish(planned)
         for i, observation in enumerate(flown.observations):
             stamp_ns = observation.stamp_ns
             if stamp_ns < BEGIN + 9.2 * S:
@@ -221,15 +217,6 @@ def test_poses_with_telemetry_are_in_map_and_metric_until_it_stops(orbited):
     assert used[-1][Key.FRAME] == "camera"
     assert texts[-1].level == b"\1"
     assert "no reported camera pose" in texts[-1].message
-
-
-def test_windows_in_map_of_a_planned_orbit_give_a_forecast_of_the_views(orbited):
-    seen = orbited[2]
-    forecasts = [views_from_ros(message) for message in seen["pose3d/views"]]
-    assert 1 <= len(forecasts) <= sum(window.header.frame_id == "map" for window in seen["pose3d/refined"])
-    for views in forecasts:
-        assert ((views.error_m > 0.005) & (views.error_m < 0.5)).all()
-        assert abs(views.turn_deg_s) < 60.0
 
 
 def test_the_recording_of_windows_in_map_repeats_them_bit_for_bit(orbited):

@@ -102,5 +102,4 @@ def test_the_recording_of_windows_in_odom_repeats_them_bit_for_bit(walked):
 
 
 def test_the_bridge_hears_no_3d_pose_and_no_transform():
-    # The forecast of a plan is errors of views, no pose: what it wishes is judged as an operator's command.
-    assert set(NODES["mavlink_bridge"].subscribes) == {"pose2d", "camera_info", "orbit/status", "pose3d/views"}
+    assert set(NODES["mavlink_bridge"].subscribes) == {"pose2d", "camera_info", "orbit/status"}

@@ -26,8 +26,8 @@ from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, KEPT_QOS, TOPICS
 
 
 def test_a_session_holds_its_provenance(tmp_path):
-    with bringup(flight_config(tmp_path / "s", seconds=0.5), FLIGHT) as graph:
-        graph.wait_finished("capture_simulator", timeout_s=60)
+    with bringup(flight_config(tmp_path / "s", tmp_path, seconds=0.5), FLIGHT) as graph:
+        graph.wait_finished("session_player", timeout_s=60)
     with open_session(tmp_path / "s") as session:
         metadata = session.info.metadata
     assert metadata["namespace"] == "/drocap"
@@ -39,7 +39,7 @@ def test_a_session_holds_its_provenance(tmp_path):
 
 def test_a_session_without_a_name_is_named_by_its_date(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with bringup(flight_config(""), ["session_recorder"]):
+    with bringup(DrocapConfig(), ["session_recorder"]):
         pass
     (folder,) = tmp_path.iterdir()
     assert folder.name.startswith("session_20")
@@ -75,9 +75,11 @@ def test_images_wait_for_a_stopped_recorder_and_excess_images_are_counted(tmp_pa
     assert recorded + missed == 1120
 
 
-def test_a_full_disk_is_an_error_of_the_recorder_alone(small_disk):
-    config = flight_config(small_disk / "s", seconds=60.0).replace("session_recorder", free_mib=0, compression="none")
-    with bringup(config, ["capture_simulator", "session_recorder"]) as graph:
+def test_a_full_disk_is_an_error_of_the_recorder_alone(small_disk, tmp_path):
+    config = flight_config(small_disk / "s", tmp_path, seconds=60.0).replace(
+        "session_recorder", free_mib=0, compression="none"
+    )
+    with bringup(config, ["session_player", "session_recorder"]) as graph:
         states, poses = [], []
         graph.node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", states.append, 100)
         graph.node.create_subscription(TOPICS["pose2d"].message, "pose2d", poses.append, TOPICS["pose2d"].qos)

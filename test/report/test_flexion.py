@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.report.flexion import flexion, flexion_words
+from drocap_ros.report.movement import flexion, flexion_words
 from drocap_ros.skeleton import BODY_15
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from browser import Browser, chromium
 
-from drocap_ros.report.flexion import flexion
 from drocap_ros.report.motion_images import MotionImages
+from drocap_ros.report.movement import flexion
 from drocap_ros.report.page import render_report, save_report
 from drocap_ros.report.people import save_people_report
 

@@ -130,7 +130,7 @@ def test_node_without_a_bringup_is_ready_at_once(context):
 
 
 def test_node_of_a_graph_is_not_ready_without_its_peers(context):
-    with initializer(context, graph_nodes="capture_simulator,initializer") as node:
+    with initializer(context, graph_nodes="pose_estimator,initializer") as node:
         spin_until_ready(context, node, 0.5)
         assert not node.ready
         assert node.details[Key.READY] == "false"

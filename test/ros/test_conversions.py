@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.orbit.view_plan import ViewForecast
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose3D
@@ -154,20 +153,3 @@ def test_unknown_values_of_the_vehicle_stay_nan():
 def test_stamps_keep_every_nanosecond():
     for stamp in (0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789):
         assert c.stamp_from_ros(c.stamp_to_ros(stamp)) == stamp
-
-
-def test_a_forecast_of_the_views_is_sent_and_a_malformed_one_refused():
-    bearing, elevation = (grid.ravel() for grid in np.meshgrid(np.arange(10.0, 370.0, 45.0), [10.0, 35.0]))
-    views = ViewForecast(bearing, elevation, np.linspace(0.02, 0.05, 16), -7.0)
-    message = c.views_to_ros(views, 7)
-    assert c.stamp_from_ros(message.header.stamp) == 7
-    for sent, value in zip(views, c.views_from_ros(message), strict=True):
-        np.testing.assert_allclose(value, sent, rtol=1e-6)
-    good = list(message.error_m)
-    for bad in ([], good[:1], good[:-1], [*good[:3], 0.0, *good[4:]], [float("nan"), *good[1:]]):
-        message.error_m = array("f", bad)
-        with pytest.raises(InputError, match="expected"):
-            c.views_from_ros(message)
-    message = c.views_to_ros(views._replace(turn_deg_s=float("inf")), 7)
-    with pytest.raises(InputError, match="error_m: expected finite"):
-        c.views_from_ros(message)

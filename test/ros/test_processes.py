@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from captured_flight import captured_config
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
@@ -17,12 +18,8 @@ from drocap_ros.ros.processes import LaunchContext, NodeProcess
 from drocap_ros.ros.topics import RESULT_QOS
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-NODES = ["capture_simulator", "initializer"]
+NODES = ["session_player", "initializer"]
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def flight():
-    return DrocapConfig().replace("capture_simulator", seconds=60.0, rate_hz=15.0)
 
 
 def name_of(pid):
@@ -32,8 +29,8 @@ def name_of(pid):
         return None
 
 
-def test_killed_node_restarts_and_works_within_six_seconds():
-    with bringup(flight(), NODES, processes=True, respawn=True) as graph:
+def test_killed_node_restarts_and_works_within_six_seconds(tmp_path):
+    with bringup(captured_config(tmp_path, 60.0), NODES, processes=True, respawn=True) as graph:
         poses = []
         graph.node.create_subscription(Pose3D, "pose3d/initial", poses.append, RESULT_QOS)
         graph.wait_until(lambda: poses, 30, "poses")
@@ -49,18 +46,19 @@ def test_killed_node_restarts_and_works_within_six_seconds():
             assert time.monotonic() - begin < 6.0
 
 
-def test_process_has_the_name_of_its_node():
-    with bringup(flight(), NODES, processes=True) as graph:
+def test_process_has_the_name_of_its_node(tmp_path):
+    with bringup(captured_config(tmp_path, 60.0), NODES, processes=True) as graph:
         assert {name: name_of(graph.pid(name)) for name in NODES} == {name: name[:15] for name in NODES}
 
 
 COMMAND = """
 import time
+import sys
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 if __name__ == "__main__":
-    config = DrocapConfig().replace("capture_simulator", seconds=60.0, rate_hz=15.0)
-    with bringup(config, ["capture_simulator", "initializer"], processes=True) as graph:
+    config = DrocapConfig().replace("session_player", session=sys.argv[1])
+    with bringup(config, ["session_player", "initializer"], processes=True) as graph:
         print(*(graph.pid(name) for name in graph.names), flush=True)
         time.sleep(60.0)
 """
@@ -69,10 +67,11 @@ if __name__ == "__main__":
 def test_nodes_stop_when_the_process_that_started_them_is_killed(tmp_path):
     script = tmp_path / "graph.py"
     script.write_text(COMMAND)
+    session = captured_config(tmp_path, 60.0).session_player.session
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = subprocess.Popen([sys.executable, script], env=env, stdout=subprocess.PIPE, text=True)
+    command = subprocess.Popen([sys.executable, script, session], env=env, stdout=subprocess.PIPE, text=True)
     pids = [int(word) for word in command.stdout.readline().split()]
-    assert {name_of(pid) for pid in pids} == {"capture_simulat", "initializer"}
+    assert {name_of(pid) for pid in pids} == {"session_player", "initializer"}
     command.kill()
     end = time.monotonic() + 15.0
     while any(name_of(pid) for pid in pids) and time.monotonic() < end:

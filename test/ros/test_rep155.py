@@ -175,25 +175,19 @@ def test_tracked_body_is_published_while_it_is_tracked(capture, prefix, namespac
         until(lambda: not node.get_publishers_info_by_topic(f"/humans/bodies/{name}/skeleton2d"))
 
 
-def test_each_of_several_persons_has_topics_of_its_own_until_it_leaves():
+def test_a_person_has_an_identifier_that_late_subscribers_hear_until_the_track_ends():
     points = np.tile([320.0, 120.0], (15, 1))
     with graph(human_topics=True) as (node, other, until):
-        bodies, persons, owners = [], [], []
-        other.create_subscription(hri.IdsList, "/humans/bodies/tracked", lambda m: bodies.append(list(m.ids)), 10)
+        persons, owners = [], []
         other.create_subscription(hri.IdsList, "/humans/persons/tracked", lambda m: persons.append(list(m.ids)), 10)
-        other.create_subscription(String, "/humans/persons/p1001/body_id", lambda m: owners.append(m.data), KEPT_QOS)
-        topics = ("pose2d", "person_2/pose2d", "person_3/pose2d")
-        publishers = [other.create_publisher(Pose2D, topic, RESULT_QOS) for topic in topics]
-        until(lambda: all(p.get_subscription_count() for p in publishers))
-        until(lambda: all(node.count_subscribers(f"/humans/{of}/tracked") for of in ("bodies", "persons")))
-        for publisher, number in zip(publishers, (7, 1001, 1002), strict=True):
-            publisher.publish(pose2d_to_ros(observation(points, track_id=number), "camera_optical"))
-        until(lambda: bodies and set(bodies[-1]) == {"b7", "b1001", "b1002"})
-        until(lambda: persons and set(persons[-1]) == {"p7", "p1001", "p1002"})
-        until(lambda: owners == ["b1001"])
-        publishers[1].publish(pose2d_to_ros(observation(points, track_id=0), "camera_optical"))
-        until(lambda: set(bodies[-1]) == {"b7", "b1002"} and set(persons[-1]) == {"p7", "p1002"})
-        until(lambda: not node.get_publishers_info_by_topic("/humans/bodies/b1001/roi"))
+        other.create_subscription(String, "/humans/persons/p7/body_id", lambda m: owners.append(m.data), KEPT_QOS)
+        publisher = other.create_publisher(Pose2D, "pose2d", RESULT_QOS)
+        until(lambda: publisher.get_subscription_count() and node.count_subscribers("/humans/persons/tracked"))
+        publisher.publish(pose2d_to_ros(observation(points, track_id=7), "camera_optical"))
+        until(lambda: persons and persons[-1] == ["p7"] and owners == ["b7"])
+        publisher.publish(pose2d_to_ros(observation(points, track_id=8), "camera_optical"))
+        until(lambda: persons[-1] == ["p8"])
+        until(lambda: not node.get_publishers_info_by_topic("/humans/bodies/b7/roi"))
 
 
 def test_without_hri_msgs_the_frames_remain_and_the_status_names_the_reason(capture, monkeypatch):

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from captured_flight import captured_config
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
@@ -20,16 +21,16 @@ from drocap_ros.config import DrocapConfig, section_types
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.ros.conversions import stamp_from_ros
-from drocap_ros.ros.topics import NODES, TOPICS, component_of, section_of
+from drocap_ros.ros.topics import NODES, TOPICS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 from drocap_ros.srv import OrbitCommand
 
-CAPTURE = ["capture_simulator", "initializer", "bundle_adjuster"]
+CAPTURE = ["session_player", "initializer", "bundle_adjuster"]
 
 
-def short_flight(seconds=3.0, seed=0, **adjuster):
+def short_flight(folder, seconds=3.0, seed=0, **adjuster):
     # Short solves: these tests are about the graph, not about accuracy.
-    config = DrocapConfig().replace("capture_simulator", seconds=seconds, seed=seed, rate_hz=15.0)
+    config = captured_config(folder, seconds, seed=seed)
     return config.replace("bundle_adjuster", **{"iterations": 10, **adjuster})
 
 
@@ -41,10 +42,10 @@ def collect(graph, *topics):
 
 
 @pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
-def test_nothing_is_lost_at_the_start_and_every_keypoint_becomes_a_pose(processes):
-    with bringup(short_flight(), CAPTURE, processes=processes) as graph:
+def test_nothing_is_lost_at_the_start_and_every_keypoint_becomes_a_pose(processes, tmp_path):
+    with bringup(short_flight(tmp_path), CAPTURE, processes=processes) as graph:
         got = collect(graph, "pose2d", "pose3d/initial", "pose3d/refined", "pose3d/latest")
-        graph.wait_finished("capture_simulator", timeout_s=60)
+        graph.wait_finished("session_player", timeout_s=60)
         graph.wait_until(lambda: len(got["pose3d/initial"]) >= 45, 20, "45 initial poses")
         graph.wait_until(lambda: got["pose3d/refined"], 20, "an adjusted window")
     keypoints, poses = got["pose2d"], got["pose3d/initial"]
@@ -66,13 +67,13 @@ def test_nothing_is_lost_at_the_start_and_every_keypoint_becomes_a_pose(processe
     assert stages[-1] == Pose3D.REFINED
 
 
-def test_two_graphs_side_by_side_receive_their_own_messages_only():
+def test_two_graphs_side_by_side_receive_their_own_messages_only(tmp_path):
     with ExitStack() as stack:
-        graphs = [stack.enter_context(bringup(short_flight(2.0, seed), CAPTURE[:2])) for seed in (0, 1)]
+        graphs = [stack.enter_context(bringup(short_flight(tmp_path, 2.0, seed), CAPTURE[:2])) for seed in (0, 1)]
         assert graphs[0].domain_id != graphs[1].domain_id
         got = [collect(graph, "pose2d") for graph in graphs]
         for graph in graphs:
-            graph.wait_finished("capture_simulator", timeout_s=60)
+            graph.wait_finished("session_player", timeout_s=60)
     first, second = (np.array([m.keypoints for m in g["pose2d"]]) for g in got)
     assert len(first) == len(second) == 30
     assert not np.array_equal(first, second)
@@ -90,15 +91,15 @@ def test_refusal_of_a_node_is_raised_by_the_bringup(processes, tmp_path):
         pytest.fail("the graph came up without its source")
 
 
-def kill_a_node_in_flight():
-    with bringup(short_flight(20.0), CAPTURE[:2], processes=True) as graph:
+def kill_a_node_in_flight(folder):
+    with bringup(short_flight(folder, 20.0), CAPTURE[:2], processes=True) as graph:
         os.kill(graph.pid("initializer"), 9)
         graph.wait_until(lambda: False, 20)
 
 
-def test_killed_process_ends_the_graph_and_the_others_stop():
+def test_killed_process_ends_the_graph_and_the_others_stop(tmp_path):
     with pytest.raises(NodeError, match="initializer ended with status -9"):
-        kill_a_node_in_flight()
+        kill_a_node_in_flight(tmp_path)
 
 
 def test_unknown_node_is_refused():
@@ -119,9 +120,9 @@ def test_bridge_without_permission_refuses_to_start_an_orbit():
     assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
 
 
-def test_priority_of_a_process_follows_the_table_in_the_session_and_out_of_the_group_of_the_command():
-    with bringup(short_flight(), CAPTURE, processes=True) as graph:
-        adjuster, simulator = graph.pid("bundle_adjuster"), graph.pid("capture_simulator")
+def test_priority_of_a_process_follows_the_table_in_the_session_and_out_of_the_group_of_the_command(tmp_path):
+    with bringup(short_flight(tmp_path), CAPTURE, processes=True) as graph:
+        adjuster, simulator = graph.pid("bundle_adjuster"), graph.pid("session_player")
         graph.wait_until(lambda: os.sched_getscheduler(adjuster) == os.SCHED_BATCH, 20, "the adjuster's priority")
         threads = [int(path.name) for path in Path(f"/proc/{adjuster}/task").iterdir()]
         assert min(os.getpriority(os.PRIO_PROCESS, thread) for thread in threads) == NODES["bundle_adjuster"].niceness
@@ -137,13 +138,13 @@ def test_priority_of_a_process_follows_the_table_in_the_session_and_out_of_the_g
     or "FASTRTPS_DEFAULT_PROFILES_FILE" in os.environ,
     reason="another middleware, or somebody's own profile",
 )
-def test_no_node_uses_shared_memory_also_not_for_the_images_of_a_driver():
+def test_no_node_uses_shared_memory_also_not_for_the_images_of_a_driver(tmp_path):
     def uses_it(name):
         return "/dev/shm/fast" in Path(f"/proc/{graph.pid(name)}/maps").read_text()
 
-    config = short_flight(seconds=10.0).replace("image_ingest", source="topic:camera/image_raw")
+    config = short_flight(tmp_path, seconds=10.0).replace("image_ingest", source="topic:camera/image_raw")
     picture = Image(height=240, width=320, encoding="bgr8", step=3 * 320, data=bytes(3 * 320 * 240))
-    with bringup(config, ["image_ingest", "capture_simulator", "initializer"], processes=True) as graph:
+    with bringup(config, ["image_ingest", "session_player", "initializer"], processes=True) as graph:
         got = collect(graph, "image/compressed")["image/compressed"]
         driver = graph.node.create_publisher(Image, "camera/image_raw", qos_profile_sensor_data)
         graph.wait_until(driver.get_subscription_count, 20, "the node to listen")
@@ -176,8 +177,8 @@ def test_images_larger_than_the_kernels_buffers_reach_the_estimator(tmp_path):
         assert images("image_ingest") >= 5
 
 
-def test_graph_stops_within_fifteen_seconds():
-    with bringup(short_flight(30.0), CAPTURE[:2]):
+def test_graph_stops_within_fifteen_seconds(tmp_path):
+    with bringup(short_flight(tmp_path, 30.0), CAPTURE[:2]):
         begin = time.monotonic()
     assert time.monotonic() - begin < 15
 
@@ -188,9 +189,9 @@ def test_table_of_the_nodes_names_existing_topics():
 
 
 def test_every_node_has_a_module_and_a_section_of_the_configuration():
-    assert {section_of(name) for name in NODES} == set(section_types())
+    assert set(NODES) == set(section_types())
     for name in NODES:
-        assert node_class(name).component == component_of(name)[0]
+        assert node_class(name).component == name
 
 
 def test_a_graph_that_ended_leaves_no_socket(tmp_path):

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from drocap_ros.cli.graph import live
-from drocap_ros.ros.topics import NODES, component_of
+from drocap_ros.ros.topics import NODES
 
 
 @pytest.fixture(scope="module")
@@ -46,5 +46,4 @@ def test_the_node_that_it_leaves_out_exists(tree):
 def test_launch_folder_and_all_nodes_are_installed(root):
     text = (root / "CMakeLists.txt").read_text()
     assert re.search(r"install\(DIRECTORY [^)]*\blaunch\b", text)
-    components = {component_of(node)[0] for node in NODES}
-    assert {path.stem for path in (root / "drocap_ros" / "nodes").glob("[a-z]*.py")} == components
+    assert {path.stem for path in (root / "drocap_ros" / "nodes").glob("[a-z]*.py")} == set(NODES)

@@ -4,9 +4,9 @@ import os
 import time
 
 import pytest
+from captured_flight import captured_config
 
 from drocap_ros.bringup import bringup
-from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.msg import OrbitStatus, Pose3D, Pose3DWindow
 from drocap_ros.recording.open_session import open_session
@@ -14,8 +14,8 @@ from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
-NODES = ["capture_simulator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
-#: Topic that proves that a node works; not of the source, which simulates its whole flight first.
+NODES = ["session_player", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
+#: Topic that proves that a node works, the source excepted.
 SIGN = {
     "initializer": ("pose3d/initial", Pose3D),
     "bundle_adjuster": ("pose3d/refined", Pose3DWindow),
@@ -24,7 +24,7 @@ SIGN = {
 
 
 def flight(session, seconds=40.0):
-    config = DrocapConfig().replace("capture_simulator", seconds=seconds, rate_hz=15.0)
+    config = captured_config(session.parent, seconds)
     config = config.replace("bundle_adjuster", iterations=5, period_s=0.5)
     config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
     return config.replace("session_recorder", session_dir=str(session))

@@ -4,12 +4,12 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
+from captured_flight import captured_config
 
 from drocap_ros.bringup import bringup, free_domain
-from drocap_ros.config import DrocapConfig
 from drocap_ros.recording.open_session import open_session
 
-NODES = ["capture_simulator", "initializer", "bundle_adjuster", "visualizer", "session_recorder"]
+NODES = ["session_player", "initializer", "bundle_adjuster", "visualizer", "session_recorder"]
 DRONES = ("drone1", "drone10")  # one name begins with the other
 
 
@@ -19,7 +19,7 @@ def test_graphs_in_two_namespaces_receive_their_own_messages_only(tmp_path, monk
     with free_domain() as domain, ExitStack() as stack:
         graphs = []
         for seed, drone in enumerate(DRONES):
-            config = DrocapConfig().replace("capture_simulator", seconds=2.0, seed=seed, rate_hz=10.0)
+            config = captured_config(tmp_path, 2.0, rate_hz=10.0, seed=seed)
             config = config.replace("session_recorder", session_dir=str(tmp_path / drone))
             graphs.append(
                 stack.enter_context(
@@ -27,7 +27,7 @@ def test_graphs_in_two_namespaces_receive_their_own_messages_only(tmp_path, monk
                 )
             )
         for graph in graphs:
-            graph.wait_finished("capture_simulator", timeout_s=60)
+            graph.wait_finished("session_player", timeout_s=60)
             graph.spin_for(1.5)  # one more status of each node
     keypoints = []
     for drone in DRONES:

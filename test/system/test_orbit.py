@@ -18,10 +18,9 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.transport import open_transport
-from drocap_ros.flight.orbit.view_plan import ViewForecast
 from drocap_ros.msg import OrbitStatus
 from drocap_ros.observation import PoseObservation
-from drocap_ros.ros.conversions import pose2d_to_ros, views_to_ros
+from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.topics import TOPICS
 from drocap_ros.simulation.keypoint_errors import noisy_keypoints
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
@@ -135,24 +134,6 @@ def test_operator_flies_an_orbit_from_the_command_line():
         assert operator(graph, "stop") == (0, "acknowledged by the operator")
         graph.wait_until(lambda: got[-1].command_accepted, 10, "a status with the accepted command")
         assert got[-1].command_condition == OrbitStatus.CONDITION_ACKNOWLEDGED
-
-
-def test_a_planned_orbit_needs_a_forecast_and_flies_by_it():
-    patience = {"max_state_age_s": 1.0, "max_state_gap_s": 2.0, "max_round_trip_s": 3.0, "max_echo_age_s": 3.0}
-    with flying(commands_enabled=True, watchdog_s=1.0, max_subject_age_s=1.0, **patience) as (graph, _, got):
-        graph.wait_until(lambda: got and got[-1].state == OrbitStatus.READY, 40, "readiness")
-        assert operator(graph, "start", "--plan", "accuracy", "--speed", "15") == (0, "orbiting the subject")
-        graph.wait_until(lambda: got[-1].condition == OrbitStatus.CONDITION_UNPLANNED, 10, "the steady orbit")
-        assert "steadily instead of by the plan: no forecast of the views (pose3d/views" in got[-1].reason
-        topic = TOPICS["pose3d/views"]
-        forecasts = graph.node.create_publisher(topic.message, "pose3d/views", topic.qos)
-        bearing, elevation = (grid.ravel() for grid in np.meshgrid(np.arange(0.0, 360.0, 45.0), [10.0, 35.0]))
-        views = ViewForecast(bearing, elevation, 0.03 + 0.02 * np.cos(np.radians(bearing)), 0.0)
-        graph.node.create_timer(0.5, lambda: forecasts.publish(views_to_ros(views, time.time_ns())))
-        graph.wait_until(lambda: got[-1].condition == OrbitStatus.CONDITION_PLANNED, 20, "the planned orbit")
-        assert "by the plan at +15 deg/s and 2.5 m high: joints within" in got[-1].reason
-        assert operator(graph, "adjust", "--plan", "steady") == (0, "orbit adjusted")
-        graph.wait_until(lambda: got[-1].condition == OrbitStatus.CONDITION_ORBITING, 10, "the steady orbit again")
 
 
 def test_a_second_publisher_of_the_keypoints_ends_the_orbit_and_forbids_another():

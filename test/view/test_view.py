@@ -15,17 +15,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from sensor_msgs.msg import CompressedImage
+from captured_flight import FLIGHT, captured_config
 
-from drocap_ros.bringup import bringup, free_domain, watch
+from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
-from drocap_ros.motion import Motion, load_motion, save_motion
-from drocap_ros.recording.open_session import open_session
-from drocap_ros.ros.conversions import header_at
+from drocap_ros.live_replay import replay
+from drocap_ros.motion import Motion, load_motion, save_motion, upright_joints
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
-from drocap_ros.view.message_view import MessageView
 from drocap_ros.view.motion_view import draw_motion
 from drocap_ros.view.rerun_output import new_recording
 from drocap_ros.view.rerun_scene import Scene
@@ -33,7 +31,6 @@ from drocap_ros.view.rerun_scene import Scene
 pytest.importorskip("rerun", reason="no Rerun viewer here: `make setup` brings it")
 
 ROOT = Path(__file__).resolve().parents[2]
-FLIGHT = ("capture_simulator", "initializer", "bundle_adjuster", "session_recorder")
 
 
 def command(*arguments):
@@ -101,13 +98,13 @@ def test_every_frame_of_a_motion_is_drawn_in_place(folder, tmp_path):
     assert re.search(r"written: .*motion\.rrd \(\d+\.\d MB\)", done.stdout)
     motion, drawn = load_motion(folder / "motion.npz"), Drawn(out)
     stamps = motion.stamp_ns.tolist()
-    points = drawn.values("/world/subject/refined/joints", "Points3D:positions")
+    points = drawn.values("/world/subject/joints", "Points3D:positions")
     assert sorted(points) == stamps
     for i, stamp in enumerate(stamps):
         known = np.isfinite(motion.joints3d[i]).all(1)
         np.testing.assert_allclose(points[stamp], motion.joints3d[i][known], atol=1e-5)
     assert len(points[stamps[4]]) == 14
-    bones = drawn.values("/world/subject/refined/bones", "LineStrips3D:strips")
+    bones = drawn.values("/world/subject/bones", "LineStrips3D:strips")
     assert [len(bones[stamp]) for stamp in stamps] == [14, 14, 14, 14, 13, 14, 14, 14, 14, 14]
     assert drawn.stamps("/plots/reprojection_px/mean")[-10:] == stamps
     # The image is 1280 px wide and drawn at 960: the keypoints are scaled by three quarters.
@@ -149,73 +146,22 @@ def test_cameras_are_placed_near_their_true_positions():
     assert np.isnan(empty).all()
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory):
-    """A flight's session, and the file of a viewer that watched it live."""
-    folder = tmp_path_factory.mktemp("flight")
-    config = DrocapConfig().replace("capture_simulator", seconds=3.0, rate_hz=15.0, seed=3)
+def test_a_session_is_drawn_as_the_live_graph_saw_it(tmp_path):
+    config = captured_config(tmp_path, 3.0)
     config = config.replace("bundle_adjuster", period_s=0.5)
-    config = config.replace("session_recorder", session_dir=str(folder / "session"))
-    with pytest.MonkeyPatch.context() as patch, free_domain() as domain:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        live = subprocess.Popen(
-            command("--live", "--domain-id", domain, "--save", folder / "live.rrd", "--seconds", 100),
-            env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )  # fmt: skip
-        try:
-            with watch("/drocap", domain) as graph:
-                graph.wait_until(lambda: graph.node.count_subscribers("pose2d") > 0, 60, "the viewer")
-            with bringup(config, FLIGHT, domain_id=domain) as graph:
-                graph.wait_finished("capture_simulator", timeout_s=60)
-                graph.spin_for(2.0)
-            live.send_signal(signal.SIGINT)
-            text, _ = live.communicate(timeout=60)
-        finally:
-            live.kill()
-    assert live.returncode == 0, text
-    return folder
-
-
-def test_a_session_is_drawn_at_the_stamps_of_its_images(flown, tmp_path):
-    done = view(flown / "session", "--save", tmp_path / "session.rrd")
+    config = config.replace("session_recorder", session_dir=str(tmp_path / "session"))
+    with bringup(config, FLIGHT) as graph:
+        graph.wait_finished("session_player", timeout_s=60)
+        graph.spin_for(2.0)
+    done = view(tmp_path / "session", "--save", tmp_path / "session.rrd")
     assert done.returncode == 0, done.stderr
     drawn = Drawn(tmp_path / "session.rrd")
-    recorded, windows = {}, []
-    with open_session(flown / "session") as session:
-        for raw, message in session.messages(("/drocap/pose2d", "/drocap/pose3d/initial", "/drocap/pose3d/refined")):
-            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-            recorded.setdefault(raw.topic, {})[stamp] = message
-            if raw.topic.endswith("refined"):
-                windows.append(message)
-    keypoints = drawn.values("/world/camera/image/keypoints", "Points2D:positions")
-    assert sorted(keypoints) == sorted(recorded["/drocap/pose2d"])
-    for stamp, message in recorded["/drocap/pose2d"].items():
-        sent = np.array(message.keypoints).reshape(-1, 2)
-        np.testing.assert_allclose(keypoints[stamp], sent[np.isfinite(sent).all(1)])
-    for part, component in (("joints", "Points3D:positions"), ("uncertainty", "Ellipsoids3D:half_sizes")):
-        assert sorted(drawn.values(f"/world/subject/initial/{part}", component)) == sorted(
-            recorded["/drocap/pose3d/initial"]
-        )
-    # Refined poses are drawn once each, those of the last window included.
-    refined = drawn.stamps("/world/subject/refined/joints")
-    last = windows[-1].poses[-1].header.stamp
-    assert refined == sorted(set(refined))
-    assert refined[-1] == last.sec * 10**9 + last.nanosec
-    # Upright: the head above the pelvis by about half a person.
-    points = drawn.values("/world/subject/initial/joints", "Points3D:positions")
-    assert all(0.3 < p[BODY_15.index("head"), 2] - p[0, 2] < 1.2 for p in points.values())
-    assert drawn.stamps("/plots/latency_ms/initial")[-1] == max(recorded["/drocap/pose3d/initial"])
-    assert any(path.startswith("/log/drocap") for path in drawn.rows)
-
-
-def test_a_running_graph_is_drawn_as_its_recording(flown, tmp_path):
-    view(flown / "session", "--save", tmp_path / "session.rrd")
-    live, offline = Drawn(flown / "live.rrd"), Drawn(tmp_path / "session.rrd")
-    path, component = "/world/subject/initial/joints", "Points3D:positions"
-    seen, recorded = live.values(path, component), offline.values(path, component)
-    assert len(seen) >= 0.8 * len(recorded)
-    for stamp, points in seen.items():
-        np.testing.assert_array_equal(points, recorded[stamp])
+    motion, _ = replay(tmp_path / "session", DrocapConfig())
+    points = drawn.values("/world/subject/joints", "Points3D:positions")
+    assert sorted(points) == motion.stamp_ns.tolist()
+    assert len(points) > 30
+    for stamp, expected in zip(motion.stamp_ns.tolist(), upright_joints(motion), strict=True):
+        np.testing.assert_allclose(points[stamp], expected, atol=1e-5)
 
 
 def two_free_ports():
@@ -280,17 +226,15 @@ def test_a_killed_command_ends_its_server(folder):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), "expected INPUT or --live, found neither"),
-        (("x.npz", "--live"), "expected INPUT or --live, found both"),
+        ((), "INPUT"),
         (("none.npz",), "none.npz"),
         ((ROOT / "README.md",), "README.md"),
         (("x.npz", "--save", "a.rrd", "--web"), "expected --save or --web"),
         (("x.npz", "--memory", "much"), "--memory: expected an amount like 1GB"),
-        (("--live", "--seconds", "-1"), "--seconds: expected more than 0"),
     ],
 )
 def test_unusable_inputs_are_refused_in_one_line(arguments, words, tmp_path):
-    out = () if "--save" in arguments or "--live" in arguments else ("--save", tmp_path / "out.rrd")
+    out = () if "--save" in arguments else ("--save", tmp_path / "out.rrd")
     done = view(*arguments, *out)
     assert done.returncode == 2
     assert words in done.stderr
@@ -304,15 +248,3 @@ def test_without_rerun_one_line_names_the_package_to_install(folder, tmp_path):
     assert done.returncode == 2
     assert "pip install 'rerun-sdk" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-
-
-def test_images_are_thinned_to_the_rate_of_a_live_viewer(tmp_path):
-    recording = new_recording("thinned")
-    recording.save(tmp_path / "thinned.rrd")
-    jpeg = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
-    messages = MessageView(Scene(recording), image_hz=10.0)
-    stamps = [10**12 + round(i * 1e9 / 30) + (i % 3) * 2_000_000 for i in range(30)]
-    for stamp in [*stamps, 10**11]:  # at the end the time jumps back, as in a loop
-        messages.take("image/compressed", CompressedImage(header=header_at(stamp, ""), data=jpeg), stamp)
-    recording.disconnect()
-    assert Drawn(tmp_path / "thinned.rrd").stamps("/world/camera/image") == [10**11, *stamps[::3]]

@@ -20,11 +20,6 @@ PIPE_WIDTH = 180
 def add_place_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--namespace`` and ``--domain-id``."""
     parser.add_argument("--namespace", type=ros_namespace, default="/drocap", help="of all topics (default /drocap)")
-    add_domain_option(parser)
-
-
-def add_domain_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--domain-id``; :func:`chosen_domain` evaluates it."""
     parser.add_argument(
         "--domain-id", metavar="N", help=f"DDS domain, 0 to {_LARGEST_DOMAIN} (default: ${_VARIABLE}, else 0)"
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from drocap_ros.cli.graph.common import add_start_options, chosen_domain, import_bringup
 from drocap_ros.cli.graph.top import dashboard_of
 from drocap_ros.cli.options import Subparsers, add_command, add_config_option, add_models_option
-from drocap_ros.cli.signals import stop_signals
+from drocap_ros.cli.running import stop_signals
 from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
 
@@ -32,7 +32,6 @@ def add_parser(subparsers: Subparsers) -> None:
     add_config_option(parser, required=True)
     add_models_option(parser)
     parser.add_argument("--source", metavar="URI", help="replaces the configuration's image_ingest.source")
-    parser.add_argument("--people", metavar="N", type=int, help="persons followed, the subject among them: 1, 2 or 3")
     parser.add_argument("--session", metavar="DIR", type=Path, help="record to this new folder")
     parser.add_argument(
         "--nodes", nargs="+", metavar="NODE", help="names of nodes (default: image_ingest to session_recorder)"
@@ -54,8 +53,6 @@ def run(args: argparse.Namespace) -> int:
     config = load_config(args.config)
     if args.source:
         config = config.replace("image_ingest", source=args.source)
-    if args.people is not None:
-        config = config.replace("pose_estimator", people=args.people)
     if args.models:
         config = config.replace("pose_estimator", models_dir=str(models_folder(args.models).absolute()))
     if args.session:

@@ -6,13 +6,11 @@ import argparse
 import dataclasses
 import math
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drocap_ros.cli.graph.common import add_place_options, chosen_domain, import_bringup
-from drocap_ros.cli.options import Subparsers, add_command, add_config_option
+from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.errors import InputError
-from drocap_ros.flight.orbit_config import PLANS
 
 if TYPE_CHECKING:
     from drocap_ros.recording.session import Message
@@ -33,23 +31,16 @@ def add_parser(subparsers: Subparsers) -> None:
         "from the autopilot first. Values that are not given stay with `adjust`; `start` and `engage` take the "
         "configured ones, also after a hold.",
     )
-    actions = ("start", "engage", "adjust", "stop", "status", "plan")
-    parser.add_argument("action", choices=actions, help="command to send; plan: draw what a plan would fly (--session)")
+    parser.add_argument("action", choices=("start", "engage", "adjust", "stop", "status"), help="command to send")
     parser.add_argument("--radius", metavar="M", type=float, help="m, from the subject")
     parser.add_argument("--height", metavar="M", type=float, help="m, above the subject's ground")
     parser.add_argument("--speed", metavar="DEG_S", type=float, help="deg/s, positive = counter-clockwise from above")
-    parser.add_argument("--plan", choices=PLANS, help="how height and speed are chosen: as asked, or for accuracy")
-    parser.add_argument("--session", metavar="S", type=Path, help="with plan: recorded flight")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="with plan: the picture (default: plan.png)")
-    add_config_option(parser)
     parser.add_argument("--timeout", metavar="S", type=float, default=10.0, help="to wait for an answer (default 10)")
     add_place_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Send the command and print the answer, or draw a plan."""
-    if args.action == "plan":
-        return _plan(args)
+    """Send the command and print the answer."""
     domain_id = chosen_domain(args)
     _check_options(args)
     bringup = import_bringup()
@@ -76,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         wanted = (args.radius, args.height, args.speed)
         radius, height, speed = (math.nan if value is None else value for value in wanted)
         command = int(Command[args.action.upper()])
-        answer = client.call_async(orbit_request(graph.node, command, radius, height, speed, args.plan or ""))
+        answer = client.call_async(orbit_request(graph.node, command, radius, height, speed))
         if not graph.wait(answer.done, end_s - time.monotonic()):
             raise InputError(
                 f"orbit: expected an answer to {args.action} within {args.timeout:g} s, found none; "
@@ -87,31 +78,13 @@ def run(args: argparse.Namespace) -> int:
         return 0 if response.accepted else 1
 
 
-def _plan(args: argparse.Namespace) -> int:
-    from drocap_ros.cli.graph.orbit_plan import preview
-    from drocap_ros.config import load_config
-
-    if args.session is None:
-        raise InputError("orbit plan: expected a recorded flight, got none; name it: --session S")
-    values = {"radius_m": args.radius, "height_m": args.height, "angular_speed_deg_s": args.speed}
-    given = {name: value for name, value in values.items() if value is not None}
-    config = dataclasses.replace(load_config(args.config).mavlink_bridge, **given)
-    print(preview(args.session, args.out or Path("plan.png"), config))
-    return 0
-
-
 def _check_options(args: argparse.Namespace) -> None:
-    for name in ("session", "out", "config"):
-        if getattr(args, name) is not None:
-            raise InputError(f"--{name}: {args.action} takes none; it is for `drocap orbit plan`")
     if not 0 < args.timeout <= 600:
         raise InputError(f"--timeout: expected above 0 and at most 600 s, got {args.timeout:g}")
     values = {"--radius": args.radius, "--height": args.height, "--speed": args.speed}
     given = {name: value for name, value in values.items() if value is not None}
-    if args.action == "adjust" and not (given or args.plan):
-        raise InputError("adjust: expected --radius, --height, --speed or --plan, got none; state what to change")
-    if args.plan and args.action in ("stop", "status"):
-        raise InputError(f"--plan: {args.action} takes none; leave it out")
+    if args.action == "adjust" and not given:
+        raise InputError("adjust: expected --radius, --height or --speed, got none; state what to change")
     for name, value in given.items():
         # To the bridge NaN means the configured value: a failed computation must not start another orbit.
         if not math.isfinite(value):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from drocap_ros.flight.bridge_config import FENCE_ROOM_M, MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.states import Command, CommandAnswer, OperatorCommand, SafetyState, State
-from drocap_ros.flight.orbit_config import PLANS, orbit_condition
+from drocap_ros.flight.orbit_config import orbit_condition
 from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
 from drocap_ros.flight.safety_config import height_condition
 from drocap_ros.flight.subject.framing import Framing
@@ -20,11 +20,9 @@ _MAX_WAITING = 16  # commands: one a step is answered, so the last one waits for
 
 
 def command_condition(command: OperatorCommand, now_ns: int) -> Condition | None:
-    """Why a command is refused whatever the state: an unknown number or plan, or a stamp too far from now."""
+    """Why a command is refused whatever the state: an unknown number, or a stamp too far from now."""
     if command.kind not in list(Command):
         return condition(ConditionCode.UNKNOWN_COMMAND, number=command.kind)
-    if command.plan not in ("", *PLANS):
-        return condition(ConditionCode.PLAN_UNKNOWN, plans=", ".join(PLANS), plan=command.plan)
     age_s = (now_ns - command.stamp_ns) / NS
     if command.stamp_ns and abs(age_s) > _COMMAND_AGE_S:
         return condition(ConditionCode.COMMAND_OUTDATED, age_s=age_s, limit_s=_COMMAND_AGE_S)

@@ -25,10 +25,8 @@ from drocap_ros.flight.orbit.flown_orbit import FlownOrbit
 from drocap_ros.flight.orbit.observer import Observer, OwnFlight
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Limits, ModeRequest, OperatorCommand, SafetyState, State
-from drocap_ros.flight.orbit.view_plan import ViewForecast, choose_view
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.orbit.way_out import way_out
-from drocap_ros.flight.orbit_goal import Wish
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.observation import PoseObservation
 
@@ -90,18 +88,6 @@ class OrbitController:
         with self._lock:
             self._desk.take(command)
 
-    def on_wish(self, wish: Wish | str) -> None:
-        """Take a plan's wish, or why it has none: it counts where the orbit's plan is ``ACCURACY``."""
-        with self._lock:
-            self._orbit.wish = wish
-
-    def on_views(self, views: ViewForecast, now_s: float) -> None:
-        """Take a forecast of the views for a plan; the loop does not wait for the choice."""
-        with self._lock:
-            present = self._orbit.planned_from(now_s)
-        if present is not None:
-            self.on_wish(choose_view(views, *present, now_s))
-
     # -- one step --------------------------------------------------------------------------------------
     def step(self, now_ns: int, now_s: float) -> ControlStatus:
         """One step of the control loop.
@@ -147,7 +133,6 @@ class OrbitController:
             self._desk.answer(order.command, decision.answer)
             if decision.answer.accepted:
                 self._orbit.take(order)
-        self._orbit.choose(self._observer.framing, now_s)
         if hung and not seen.jumped:
             self._hold_as_watchdog()
         if self.safety.state != before.state:

@@ -22,12 +22,11 @@ from drocap_ros.flight.orbit.motion_checks import (
     outdated_condition,
 )
 from drocap_ros.flight.orbit.states import Limits, Pace
-from drocap_ros.flight.subject.framing import LEAST_PACE, framed_pace
 
 _C = ConditionCode
 _USUAL_SUBJECT_AGE_S = 0.24  # a camera at 15 Hz, and 0.17 s for its network
 _STANDING_AGE = 5 / 6  # of max_subject_age_s, 0.33 s: the last moving setpoint
-_COMES_M_S = 0.3  # speed of the subject towards the vehicle, from which the orbit gives way unslowed
+_LEAST_PACE = 0.3  # share of its speed at which an orbit gives way still: one that stands would not
 _CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
 
 
@@ -39,7 +38,7 @@ class Allowed(NamedTuple):
 
 
 def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
-    """The pace by the greatest age, relative to its limits, of subject, attitude, position and link, and by framing."""
+    """The pace by the greatest age, relative to its limits, of subject, attitude, position and link."""
     safety = limits.safety
     usual_s = safety.max_state_age_s
     halt_s = 0.5 * (usual_s + oldest_state_s(safety, patient=True))
@@ -47,7 +46,7 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
     usual_subject_s = min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s)
     allowed = Allowed(1.0, None)
     if seen.subject.contradicted:  # at once: most of what is flown after a jump is flown before the hold
-        allowed = Allowed(LEAST_PACE, condition(_C.OTHER_SUBJECT, age_s=seen.subject.age_s))
+        allowed = Allowed(_LEAST_PACE, condition(_C.OTHER_SUBJECT, age_s=seen.subject.age_s))
     pace = _share(seen.subject.age_s, usual_subject_s, subject_s)
     if pace < allowed.pace:
         allowed = Allowed(pace, outdated_condition(seen, usual_subject_s))
@@ -61,10 +60,6 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
             allowed = Allowed(pace, condition(code, age_s=age_s))
     if allowed.cause is None:  # the reference waits by itself
         allowed = allowed._replace(cause=keeping_condition(seen, limits, GUST_S))
-    # A slower orbit gives way more slowly: a subject who comes nearer leaves the picture, and is near.
-    framed = min(max(framed_pace(seen.pictures.framing_margin), seen.subject.approach_m_s / _COMES_M_S), 1.0)
-    if framed < allowed.pace:
-        allowed = Allowed(framed, condition(_C.SUBJECT_AT_BORDER, margin_percent=100 * seen.pictures.framing_margin))
     return allowed
 
 
@@ -103,7 +98,7 @@ def slowed(setpoint: Setpoint, pace: Pace, max_acceleration_m_s2: float) -> Setp
     if pace.value == 1.0 and pace.rate == 0.0:
         return setpoint
     if pace.place is not None:
-        way = min(pace.value / LEAST_PACE, 1.0)  # below it the setpoint is nearer than the reference
+        way = min(pace.value / _LEAST_PACE, 1.0)  # below it the setpoint is nearer than the reference
         setpoint = setpoint._replace(position=pace.place + way * (setpoint.position - pace.place))
     acceleration = pace.value**2 * setpoint.acceleration
     if pace.value > 0.0:

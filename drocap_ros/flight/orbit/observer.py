@@ -137,8 +137,7 @@ class Observer:
         by_size = self._guard.sight(motion.position, self._history.offset, now_ns)
         subject = Subject() if estimate is None else _subject(estimate, self._history.offset, motion, by_size)
         away_m, away_s = self._keeping.watch(own.reference, motion.position, now_s)
-        distance_m = math.nan if estimate is None else _distance(motion, estimate.position + self._history.offset)
-        margin = self.framing.watch(vehicle, motion, distance_m, dt)
+        self.framing.watch(vehicle, motion.velocity, dt)
         followed = not not_followed or not seen.autopilot.needs_mode_to_stop
         if not_followed and disturbance is None:
             disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, evidence=not_followed)
@@ -146,7 +145,7 @@ class Observer:
             seen,
             vehicle=motion,
             subject=subject,
-            pictures=dataclasses.replace(pictures, camera_problem=seen.pictures.camera_problem, framing_margin=margin),
+            pictures=dataclasses.replace(pictures, camera_problem=seen.pictures.camera_problem),
             course=Course(followed, away_m, away_s),
             intruder=own.intruder,
             disturbance=disturbance,
@@ -241,10 +240,6 @@ def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: Veh
         ),
         pictures=Pictures(camera_problem=estimator.mount.problem(autopilot, now_ns)),
     )
-
-
-def _distance(motion: Motion, place: np.ndarray) -> float:
-    return float(np.hypot(*(motion.position[:2] - place[:2])))
 
 
 def _subject(estimate: SubjectEstimate, offset: np.ndarray, motion: Motion, by_size: SizeSight | None) -> Subject:

@@ -150,7 +150,6 @@ class OperatorCommand:
     kind : number of a :class:`Command`
     radius_m, height_m, angular_speed_deg_s : NaN = as at present (adjust) or as configured
     stamp_ns : when it was given; 0 = now
-    plan : one of ``PLANS``; "" = as at present (adjust) or as configured
     """
 
     kind: int
@@ -158,7 +157,6 @@ class OperatorCommand:
     height_m: float = math.nan
     angular_speed_deg_s: float = math.nan
     stamp_ns: int = 0
-    plan: str = ""
 
 
 class CommandAnswer(NamedTuple):

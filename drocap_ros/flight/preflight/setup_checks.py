@@ -195,7 +195,7 @@ def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehi
     framing = Framing(config)
     framing.matrix, framing.size = matrix, setup.image_size
     if config.mount != "fixed" and vehicle is not None:
-        framing.watch(vehicle, Motion(), math.nan, 0.0)
+        framing.watch(vehicle, Motion().velocity, 0.0)
     view = framing.view()
     pitch_deg = -best_pitch_deg(config) if view is None else math.degrees(view.pitch)
     fit = person_in_picture(config, matrix, -pitch_deg)
@@ -222,13 +222,14 @@ def _unaimed_camera(
 ) -> tuple[Level, list[str]]:
     """As the bridge judges an orbit by a camera that nothing points: it leans with the body, or a mount keeps it."""
     goal = goal_of(config)
-    refusal = framing.refusal(goal)
-    if refusal is not None:
-        return Level.MISSING, [str(refusal.values["remedy"])]
+    lost, pitch_deg = framing.refusal(goal) is not None, -best_pitch_deg(config)
     if view.level:
-        # Flown, with a part of the person cut off.
-        remedy = f"set gimbal_control to true, or point the mount to {-best_pitch_deg(config):.0f} deg before the start"
-        return (Level.OK, []) if inside else (Level.WARNING, [remedy])
+        # Flown also with a part of the person cut off.
+        remedy = f"set gimbal_control to true, or point the mount to {pitch_deg:.0f} deg before the start"
+        return (Level.OK, []) if inside and not lost else (graded(missing=lost, warning=True), [remedy])
+    if lost:
+        remedy = f"tilt the camera to {pitch_deg:.0f} deg (camera_pitch_deg), fly slower or farther, or use a gimbal"
+        return Level.MISSING, [remedy]
     problems = []
     if orbit_margin(view, goal, config.body_height_m, _WIND_LEAN_M_S2) < 0:
         problems.append("a wind of 8 m/s would lean the person out of it: use a gimbal, or fly farther away")

@@ -15,7 +15,6 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.observed import Motion
 from drocap_ros.flight.orbit_goal import OrbitGoal
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S
 from drocap_ros.flight.vehicle_state import VehicleState
@@ -31,11 +30,8 @@ _LEAST_UP = 0.3  # of the body's axis; beyond it the vehicle tumbles
 _STILL_M_S = 0.5  # a hover: below it for so long, the vehicle leans by the wind alone
 _SETTLED_S = 1.0  # the lean of the braking before has gone
 _LEARNING_S = 4.0  # of the lean against wind: a gust passes, the wind stays
-_STEADY_S = 0.7  # over which the margin now is averaged: a slower orbit cannot follow a gust
 _SAME_CAMERA = 0.03  # of the focal length, by which a camera matrix may change
 _CUT_OFF = 0.2  # share of the picture's height by which a mount may cut off feet or head: it does not lean further
-_COMFORT = 0.08  # share of the picture's height below which the orbit slows down
-LEAST_PACE = 0.3  # share of its speed at which an orbit gives way still: one that stands would not
 
 
 class View(NamedTuple):
@@ -86,11 +82,6 @@ def _left_down(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.stack([zero + 1, zero, zero], -1), np.stack([zero, c, s], -1), np.stack([zero, -s, c], -1)], -2)
 
 
-def framed_pace(margin: float) -> float:
-    """Share of its speed at which an orbit is flown with this margin; it leans less then."""
-    return min(max(margin / _COMFORT, LEAST_PACE), 1.0)
-
-
 def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float) -> float:
     """Least margin on an orbit, from its start on, whose lean against the wind is an acceleration of ``wind`` m/s^2.
 
@@ -136,7 +127,6 @@ class Framing:
         self._wind = np.zeros(2)  # m/s^2 ENU, by which the vehicle leans without accelerating
         self._still_s = 0.0
         self._learned_s = 0.0
-        self._margin = math.nan
 
     def calibrate(self, matrix: np.ndarray) -> Condition | None:
         """Take a camera matrix (3, 3) px; returns a condition where it is that of another camera or zoom."""
@@ -151,29 +141,16 @@ class Framing:
             return None
         return condition(ConditionCode.CAMERA_CHANGED, before_px=before[0, 0], now_px=self.matrix[0, 0])
 
-    def watch(self, vehicle: VehicleState, motion: Motion, distance_m: float, dt: float) -> float:
-        """The margin now; infinite = unknown or no matter.  Learns the lean against wind, ``dt`` s after the last one.
-
-        distance_m : from the subject, horizontal; NaN = unknown
-        """
+    def watch(self, vehicle: VehicleState, velocity: np.ndarray, dt: float) -> None:
+        """Learn the lean against wind, ``dt`` s after the last one; velocity (3,) m/s."""
         self._mount_pitch = _pitch(vehicle.gimbal_orientation_xyzw)
         view = self.view()
         if view is None or view.level or not np.isfinite(vehicle.orientation_xyzw).all():
-            return math.inf
-        forward, left, up = matrix_from_quaternion(vehicle.orientation_xyzw).T
+            return
+        up = matrix_from_quaternion(vehicle.orientation_xyzw)[:, 2]
         if up[2] < _LEAST_UP:
-            return math.inf
+            return
         step_s = min(max(dt, 0.0), 0.2)
-        self._learn_lean(up, motion.velocity, step_s)
-        if not math.isfinite(distance_m + motion.height_m):
-            return math.inf
-        ahead, aside = np.arcsin(np.clip([-forward[2:], -left[2:]], -1.0, 1.0))
-        margin = framing_margin(view, max(distance_m, 0.5), motion.height_m, self._config.body_height_m, ahead, aside)
-        share = min(step_s / _STEADY_S, 1.0) if math.isfinite(self._margin) else 1.0
-        self._margin = (1 - share) * np.nan_to_num(self._margin) + share * float(margin[0])
-        return float(self._margin)
-
-    def _learn_lean(self, up: np.ndarray, velocity: np.ndarray, step_s: float) -> None:
         # Only a hover leans by the wind alone.
         self._still_s = self._still_s + step_s if float(np.hypot(*velocity[:2])) < _STILL_M_S else 0.0
         if self._still_s > _SETTLED_S:
@@ -182,16 +159,13 @@ class Framing:
             self._wind = self._wind + share * (_GRAVITY * up[:2] / up[2] - self._wind)
 
     def refusal(self, goal: OrbitGoal) -> Condition | None:
-        """Why an orbit loses the person, with what would keep them; None = it does not, or nothing is known."""
+        """Why an orbit loses the person; None = it does not, or nothing is known."""
         view, config = self.view(), self._config
         if view is None:
             return None
-        wind = float(np.hypot(*self._wind))
-        body = config.body_height_m
-        margin = orbit_margin(view, goal, body, wind)
+        margin = orbit_margin(view, goal, config.body_height_m, float(np.hypot(*self._wind)))
         if margin >= (-_CUT_OFF if view.level else 0.0):
             return None
-        first = "set gimbal_control to true, or " if view.level and not config.gimbal_control else ""
         return condition(
             ConditionCode.PERSON_LEAVES_PICTURE,
             missing_percent=-100 * margin,
@@ -201,7 +175,9 @@ class Framing:
             camera=f"a mount that stays at {math.degrees(view.pitch):.0f} deg"
             if view.level
             else "the fixed camera, as the body leans,",
-            remedy=first + _remedy(view, goal, body, wind, config.max_distance_m),
+            remedy="point the mount at the person, or set gimbal_control to true"
+            if view.level
+            else "tilt the camera to the person, fly slower or farther away, or use a wider lens or a gimbal",
         )
 
     def least_radius(self, goal: OrbitGoal, subject_speed_m_s: float, gives_way_s: float) -> float:
@@ -235,27 +211,3 @@ def _pitch(camera_xyzw: np.ndarray) -> float:
     if not np.isfinite(camera_xyzw).all():
         return math.nan
     return math.asin(min(max(float(matrix_from_quaternion(camera_xyzw)[2, 0]), -1.0), 1.0))
-
-
-def _remedy(view: View, goal: OrbitGoal, body_height_m: float, wind: float, max_radius_m: float) -> str:
-    """What keeps the person in the picture, as words: another pitch, a slower or a wider orbit; else another lens."""
-
-    def keeps(view: View, goal: OrbitGoal) -> bool:
-        return orbit_margin(view, goal, body_height_m, wind) >= 0.0
-
-    words = []
-    pitches = [math.radians(d) for d in range(-80, 31, 1)]
-    best = max(pitches, key=lambda p: orbit_margin(view._replace(pitch=p), goal, body_height_m, wind))
-    if keeps(view._replace(pitch=best), goal):
-        how = "point the mount to {:.0f} deg" if view.level else "tilt the camera to {:.0f} deg (camera_pitch_deg)"
-        words.append(how.format(math.degrees(best)))
-    speed = math.degrees(abs(goal.angular_speed_rad_s))
-    slower = range(math.ceil(speed) - 1, 1, -1)
-    kept = next((d for d in slower if keeps(view, goal._replace(angular_speed_rad_s=math.radians(d)))), None)
-    if kept:
-        words.append(f"fly at most {kept} deg/s")
-    radii = np.arange(math.ceil(2 * goal.radius_m + 0.01) / 2, max_radius_m + 0.01, 0.5)
-    wider = [r for r in radii if keeps(view, goal._replace(radius_m=float(r)))]
-    if wider:
-        words.append(f"fly at {wider[0]:g} m or more")
-    return ", or ".join(words) or "use a wider lens or a gimbal"

@@ -61,9 +61,6 @@ class PoseEstimatorConfig(Parameters):
         minimum=0,
         maximum=10,
     )
-    people: int = param(
-        1, "persons followed live, the subject and others beside it, each on topics of its own", minimum=1, maximum=3
-    )
     max_load_level: int = param(
         3,
         "highest level of load shedding: images in sequence whose keypoints are propagated by optical flow; 0 = full"

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from drocap_ros.background import Background
+from drocap_ros.tracks import Tracks
 
 #: Points with which an image tells.
 _LEAST_POINTS = 12
@@ -21,6 +22,14 @@ _GROWS = 0.05
 _AT_ONCE = 4.0
 #: Distance (px) of points from their middle below which they tell no growth: errors of tracks are as large.
 _SAME_PX = 1.0
+
+
+def cut_times(tracks: Tracks) -> list[float]:
+    """Times (s) of the cuts in a clip without telemetry, by its fixed points."""
+    if tracks.background is None or tracks.camera_rotation is not None:
+        return []
+    time_s = (tracks.stamp_ns - tracks.stamp_ns[0]) * 1e-9
+    return [float(time_s[image]) for image in cuts(tracks.background, time_s)]
 
 
 def cuts(points: Background, time_s: np.ndarray) -> list[int]:

@@ -1,12 +1,10 @@
-"""A camera fixed to the body: what keeps the person in the picture is flown, the rest is refused with a remedy."""
+"""A camera fixed to the body: an orbit that would lose the person is refused."""
 
 import dataclasses
 import math
-import re
 
 import numpy as np
 import pytest
-from orbit_observations import changed
 from scipy.spatial.transform import Rotation
 
 from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
@@ -14,12 +12,10 @@ from drocap_ros.flight.autopilot.px4 import PX4
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import camera_rotation
-from drocap_ros.flight.observed import Motion, Observed
 from drocap_ros.flight.orbit.controller import OrbitController
-from drocap_ros.flight.orbit.degradation import allowed_pace
-from drocap_ros.flight.orbit.states import Command, Limits, State
+from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.flight.orbit_goal import goal_of
-from drocap_ros.flight.subject.framing import Framing, View, framing_margin, nearest_framed, orbit_margin
+from drocap_ros.flight.subject.framing import Framing, View, framing_margin, nearest_framed
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.vehicle.mount import tilted_camera
@@ -27,7 +23,6 @@ from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 SIZE = (1280, 720)
 MATRIX = pinhole_matrix(*SIZE, 60.0)
-FRESH = changed(Observed(), subject_age_s=0.1, link_age_s=0.0, state_age_s=0.0, position_age_s=0.0, subject=np.zeros(3))
 CONFIG = MavlinkBridgeConfig(mount="fixed", camera_pitch_deg=-11.0)
 
 
@@ -38,7 +33,7 @@ def framing(config=CONFIG, wind_m_s2=0.0):
     lean = Rotation.from_euler("y", math.atan2(wind_m_s2, 9.81)).as_quat()  # nose east, wind from the east
     hover = VehicleState(1, orientation_xyzw=lean)
     for _ in range(400):
-        watched.watch(hover, Motion(velocity=np.zeros(3)), math.nan, 0.05)
+        watched.watch(hover, np.zeros(3), 0.05)
     return watched
 
 
@@ -90,32 +85,21 @@ def test_px4_keeps_one_who_walks_in_the_picture_of_a_fixed_camera_and_says_how_f
     assert any("instead of 6.0: there the fixed camera keeps" in str(condition) for condition in said)
 
 
-def test_the_orbit_is_refused_that_loses_the_person_and_the_remedies_keep_them():
+def test_the_orbit_is_refused_that_loses_the_person():
     flat = dataclasses.replace(CONFIG, camera_pitch_deg=4.0)
     refusal = framing(flat).refusal(goal_of(flat))
     assert refusal.code == ConditionCode.PERSON_LEAVES_PICTURE
-    pitch = float(re.search(r"tilt the camera to (-?\d+) deg", str(refusal)).group(1))
-    assert -20 < pitch < -5
-    assert framing(dataclasses.replace(CONFIG, camera_pitch_deg=pitch)).refusal(goal_of(flat)) is None
-    radius = float(re.search(r"fly at ([\d.]+) m or more", str(refusal)).group(1))
-    assert framing(flat).refusal(goal_of(flat, radius_m=radius)) is None
-    assert framing(flat).refusal(goal_of(flat, radius_m=radius - 1.0)) is not None
+    assert framing(CONFIG).refusal(goal_of(flat)) is None
+    assert framing(flat).refusal(goal_of(flat, radius_m=18.0)) is None
 
 
-def test_wind_makes_the_orbit_slower():
+def test_wind_allows_slower_orbits_only():
     config = dataclasses.replace(CONFIG, camera_pitch_deg=-15.0)  # aimed for an orbit that leans little
     goal = goal_of(config)
     assert framing(config).refusal(goal) is None
     refusal = framing(config, wind_m_s2=0.7).refusal(goal)
     assert refusal.code == ConditionCode.PERSON_LEAVES_PICTURE
-    slow = float(re.search(r"fly at most (\d+) deg/s", str(refusal)).group(1))
-    assert 2 <= slow < 19
-    assert framing(config, wind_m_s2=0.7).refusal(goal_of(config, angular_speed_deg_s=slow)) is None
-    assert framing(config, wind_m_s2=0.7).refusal(goal_of(config, angular_speed_deg_s=slow + 1)) is not None
-
-
-def test_a_storm_asks_for_another_lens():
-    assert str(framing(wind_m_s2=6.0).refusal(goal_of(CONFIG))).endswith("use a wider lens or a gimbal")
+    assert framing(config, wind_m_s2=0.7).refusal(goal_of(config, angular_speed_deg_s=2.0)) is None
 
 
 def test_only_a_fixed_camera_is_checked():
@@ -131,22 +115,17 @@ def test_a_mount_that_does_not_follow_is_checked_at_the_pitch_that_it_reports(co
     config = MavlinkBridgeConfig(gimbal_control=commanded)
     mount, low, high = Framing(config), goal_of(config), goal_of(config, height_m=6.0)
     mount.matrix, mount.size = MATRIX, SIZE
-    unknown = Motion()
     down = Rotation.from_euler("y", math.radians(14)).as_quat()
-    assert (
-        mount.watch(VehicleState(1, gimbal_orientation_xyzw=down), unknown, 6.0, 0.05) == math.inf
-    )  # it does not lean
+    mount.watch(VehicleState(1, gimbal_orientation_xyzw=down), np.zeros(3), 0.05)
     assert (mount.refusal(high) is None) == commanded
     mount.follows = False  # a refusal of the autopilot
     assert mount.refusal(low) is None
     refusal = mount.refusal(high)
     assert refusal.code == ConditionCode.PERSON_LEAVES_PICTURE
-    assert ("set gimbal_control" in str(refusal)) != commanded
-    pitch = float(re.search(r"point the mount to (-?\d+) deg", str(refusal)).group(1))
-    aimed = Rotation.from_euler("y", math.radians(-pitch)).as_quat()
-    mount.watch(VehicleState(1, gimbal_orientation_xyzw=aimed), unknown, 6.0, 0.05)
+    aimed = Rotation.from_euler("y", math.radians(40)).as_quat()
+    mount.watch(VehicleState(1, gimbal_orientation_xyzw=aimed), np.zeros(3), 0.05)
     assert mount.refusal(high) is None
-    mount.watch(VehicleState(1), unknown, 6.0, 0.05)  # another condition says that its pitch is unknown
+    mount.watch(VehicleState(1), np.zeros(3), 0.05)  # another condition says that its pitch is unknown
     assert mount.refusal(low) is None
 
 
@@ -159,26 +138,6 @@ def test_an_adjustment_that_takes_the_person_out_of_a_still_mounts_picture_is_re
     _, answer = loop.answers[-1]
     assert (answer.accepted, answer.condition.code) == (False, ConditionCode.PERSON_LEAVES_PICTURE)
     assert loop.controller.safety.state == State.ORBITING
-
-
-def test_the_margin_now_follows_the_lean():
-    watched = framing()
-    motion = Motion(height_m=2.5, velocity=np.zeros(3))
-    level = VehicleState(1, orientation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]))
-    down = VehicleState(1, orientation_xyzw=Rotation.from_euler("y", 0.6).as_quat())
-    assert watched.watch(level, motion, 6.0, 0.05) > 0.1
-    for _ in range(60):
-        last = watched.watch(down, motion, 6.0, 0.05)
-    assert last < 0.0
-    limits = Limits(CONFIG, CONFIG)
-    slowed = allowed_pace(changed(FRESH, framing_margin=last), limits)
-    assert 0.0 < slowed.pace < 0.5
-    assert slowed.cause.code == ConditionCode.SUBJECT_AT_BORDER
-    assert allowed_pace(changed(FRESH, framing_margin=0.2), limits).pace == 1.0
-    # From a person who comes nearer a slower orbit would not give way.
-    coming = changed(FRESH, framing_margin=last, approach_m_s=0.8)
-    assert allowed_pace(coming, limits).pace == 1.0
-    assert orbit_margin(View(MATRIX, SIZE, math.radians(-11)), goal_of(CONFIG), 1.7, 0.0) > 0.1
 
 
 def test_a_slow_change_of_the_camera_counts_once_it_adds_up_to_more_than_three_percent():
