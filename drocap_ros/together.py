@@ -10,7 +10,7 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.motion import Motion
 from drocap_ros.parameters import Values
 from drocap_ros.pipeline import Selection, input_tracks, with_origin
-from drocap_ros.reconstruction.reconstruct import SolvedView, solve_view
+from drocap_ros.reconstruction.reconstruct import Solved, solve
 from drocap_ros.reconstruction.together.joined import join_views
 from drocap_ros.recording.video_telemetry import Telemetry
 from drocap_ros.tracks import Tracks
@@ -32,7 +32,7 @@ def reconstruct_together(
     paths : inputs of :func:`reconstruct_input`, two at least; the times of the first one's images are those of all
     telemetry : none, or that which the recordings have with them
     """
-    solved: list[SolvedView] = []
+    solved: list[Solved] = []
     read: list[tuple[Path, Values, float]] = []
     tracks: list[Tracks] = []
     for path in paths:
@@ -40,11 +40,9 @@ def reconstruct_together(
         own, origin = input_tracks(path, config, models, progress, telemetry, Selection(threads=threads))
         read.append((path, origin, time.perf_counter() - begin))
         tracks.append(own)
-        solved.append(
-            solve_view(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress)
-        )
+        solved.append(solve(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress))
     begin = time.perf_counter()
-    motions = join_views(solved, [path.name for path in paths], config.bundle_adjuster.threads)
+    motions = join_views(solved, [path.name for path in paths])
     took = time.perf_counter() - begin
     for motion in motions:
         alone = motion.meta["seconds"]

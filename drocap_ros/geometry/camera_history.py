@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath, Teller
 from drocap_ros.geometry.interpolation import MAX_GAP_S, interpolate
 from drocap_ros.geometry.rotations import matrix_from_quaternion, unit_quaternions
 
@@ -19,34 +19,6 @@ _LATE_NS = 10**9
 #: Images may be so much older than the newest pose.
 _BEHIND_NS = 5 * 10**9
 _GAP_NS = round(MAX_GAP_S * 1e9)
-
-
-class WindowCamera(NamedTuple):
-    """The camera at F images.
-
-    rotation : (F, 3, 3) world (ENU) -> camera, NaN where unknown
-    position : (F, 3) m ENU, NaN where unknown
-    matrix : (3, 3) px
-    """
-
-    rotation: np.ndarray
-    position: np.ndarray
-    matrix: np.ndarray
-
-    @property
-    def known(self) -> np.ndarray:
-        """(F,) bool."""
-        known: np.ndarray = np.isfinite(self.position).all(axis=1) & np.isfinite(self.rotation).all(axis=(1, 2))
-        return known
-
-    @property
-    def focal_px(self) -> float:
-        """Focal length."""
-        return 0.5 * float(self.matrix[0, 0] + self.matrix[1, 1])
-
-    def frames(self, use: slice) -> WindowCamera:
-        """The camera at some of the images."""
-        return self._replace(rotation=self.rotation[use], position=self.position[use])
 
 
 class CameraHistory:
@@ -104,8 +76,8 @@ class CameraHistory:
             return "no usable camera_info has arrived; calibrate the camera, or set image_ingest.horizontal_fov_deg"
         return "camera_info is for images of {}x{} px, pose2d of {}x{}".format(*self._matrices[-1][2], *size)
 
-    def along(self, stamp_ns: np.ndarray, size: tuple[int, int] = (0, 0)) -> WindowCamera | None:
-        """The camera at images of increasing stamps (F,); None where no calibration is known.
+    def along(self, stamp_ns: np.ndarray, size: tuple[int, int] = (0, 0)) -> CameraPath | None:
+        """The camera at images of increasing stamps (F,), NaN where unknown; None where no calibration is known.
 
         Only a calibration of images of ``size`` (width, height) px counts; 0 = unknown.
         Between two poses up to 2 s apart values are interpolated; beyond the newest one they hold for 0.1 s.
@@ -118,12 +90,12 @@ class CameraHistory:
         end = min(bisect_right(self._stamps, last_ns + _GAP_NS), bisect_left(self._stamps, last_ns) + 1)
         if begin >= end:
             unknown = np.full((len(stamp_ns), 3, 3), np.nan)
-            return WindowCamera(unknown, unknown[:, 0], matrix)
+            return CameraPath(stamp_ns, unknown, unknown[:, 0], matrix, "given", Teller.REPORTS)
         known_ns, poses = np.array(self._stamps[begin:end], np.int64), np.array(self._poses[begin:end])
         position, _ = interpolate(known_ns, poses[:, :3], stamp_ns, spherical=False)
         orientation, _ = interpolate(known_ns, poses[:, 3:], stamp_ns, spherical=True)
         rotation = np.swapaxes(matrix_from_quaternion(orientation), 1, 2)
-        return WindowCamera(rotation, position, matrix)
+        return CameraPath(stamp_ns, rotation, position, matrix, "given", Teller.REPORTS)
 
     def _matrix(self, stamp_ns: int, size: tuple[int, int]) -> np.ndarray | None:
         """Calibration of the last change up to a stamp; the first one before that."""

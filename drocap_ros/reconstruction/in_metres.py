@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TypeAlias
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath, Teller
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, with_fusion
-from drocap_ros.reconstruction.camera.picture_world import PictureWorld, at_assumed_stature, seen_from_camera
+from drocap_ros.reconstruction.camera.fusion import with_measured
+from drocap_ros.reconstruction.camera.picture_world import at_assumed_stature, seen_from_camera
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -17,27 +17,22 @@ from drocap_ros.reconstruction.common.spread import packed
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
 from drocap_ros.reconstruction.person_view import aside, true_shape
-from drocap_ros.reconstruction.shared_camera import SharedCamera
+from drocap_ros.reconstruction.shared_camera import held, stature
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import WorldPoses, metres_per_px
 from drocap_ros.reconstruction.world.refine import RefinedWorld
-from drocap_ros.reconstruction.world.world_model import world_config
+from drocap_ros.reconstruction.world.world_model import config_of, world_config
 from drocap_ros.skeleton import JointSet
-from drocap_ros.tracks import Tracks
-
-#: What knows the camera better than the telemetry as reported.
-Source: TypeAlias = FusedTelemetry | PictureWorld | SharedCamera | None
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What the steps of one reconstruction have in common; ``lens`` : where the camera's matrix comes from."""
+    """What the steps of one reconstruction have in common."""
 
     method: str
     initializer: InitializerConfig
     adjuster: BundleAdjusterConfig
     progress: Progress
-    lens: str
 
     @property
     def body(self) -> JointSet:
@@ -60,54 +55,55 @@ class Body:
     meta: dict[str, object]
 
 
-def by_place(tracks: Tracks, settings: Settings) -> bool:
+def as_seen(camera: CameraPath) -> CameraPath:
+    """The camera as far as a method may see it: a rotation whose up is unsure bends bodies."""
+    return camera if camera.errors is not None else dataclasses.replace(camera, rotation=None, position=None)
+
+
+def by_place(camera: CameraPath) -> bool:
     """Whether the person is taken as in the middle of the picture: with nothing but an assumed lens.
 
     On phone videos a turn by nothing but the place in the picture bends the knees more: 8.3 degrees off, 7.2 without.
     """
-    return settings.lens == "assumed" and tracks.camera_rotation is None
+    return camera.lens == "assumed" and as_seen(camera).rotation is None
 
 
-def in_metres(
-    tracks: Tracks,
-    keypoints: Keypoints2D,
-    poses: ImagePoses,
-    settings: Settings,
-    source: Source = None,
-) -> Body | Refusal:
+def in_metres(keypoints: Keypoints2D, poses: ImagePoses, camera: CameraPath, settings: Settings) -> Body | Refusal:
     """The one step from px to m: in the world where the camera's rotation is known, else in the camera's axes.
 
-    In the world the poses are placed by the reported camera and, with its position and matrix, adjusted with it.  The
-    answer is a refusal where its telemetry cannot be true.
+    In the world the poses are placed by the camera and, with its position and matrix, adjusted with it.  The answer
+    is a refusal where its telemetry cannot be true.
     """
-    height_m, alone = settings.initializer.assumed_height_m, _alone(source)
-    about_pelvis = by_place(dataclasses.replace(tracks, camera_rotation=None) if alone else tracks, settings)
-    shape = true_shape(poses.in_image, tracks.camera_matrix, about_pelvis=about_pelvis)
-    per_px = metres_per_px(shape, tracks.stamp_ns, height_m)
-    if isinstance(source, SharedCamera):
-        seen = aside(poses, tracks.camera_matrix) if about_pelvis and tracks.camera_matrix is not None else poses
-        factor, std = source.stature(seen_from_camera(tracks, seen, per_px))
-        height_m, per_px, source = factor * height_m, factor * per_px, source.for_stature(std)
+    height_m, stamp_ns, config = settings.initializer.assumed_height_m, camera.stamp_ns, world_config(settings.adjuster)
+    shape = true_shape(poses.in_image, camera.matrix, about_pelvis=by_place(camera))
+    per_px = metres_per_px(shape, stamp_ns, height_m)
+    if camera.teller is Teller.PERSON:
+        assert camera.matrix is not None
+        seen = aside(poses, camera.matrix) if by_place(camera) else poses
+        factor, std = stature(camera, seen_from_camera(camera, seen, per_px))
+        height_m, per_px, camera = factor * height_m, factor * per_px, dataclasses.replace(camera, scale_std=std)
     meta: dict[str, object] = {
-        "lens": settings.lens,
+        "lens": camera.lens,
         "assumed_height_m": height_m,
         "reference_stature_m": REFERENCE_STATURE_M,
     }
+    meta |= {} if camera.words is None else {"camera": camera.words}
+    about = shape * per_px[:, None, None]
     refined: RefinedWorld | None = None
-    rotation = tracks.camera_rotation
-    if rotation is None:
-        rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
-        placed = WorldPoses(shape * per_px[:, None, None], False, "assumed_height", None)
+    if camera.rotation is None:
+        rotation, frame = np.broadcast_to(np.eye(3), (len(stamp_ns), 3, 3)).copy(), "camera"
+        placed = WorldPoses(about, False, "assumed_height", None)
     else:
-        frame = "world"
-        config = world_config(settings.adjuster) if source is None else source.config
-        placed, refined, refusal = in_world(tracks, keypoints, poses, per_px, config)
+        rotation, frame = camera.rotation, "world"
+        expected = None if camera.errors is None else config_of(camera, config)
+        placed, refined, refusal = in_world(camera, keypoints, poses, per_px, expected)
         if refusal is not None:
             return refusal
-        if alone:
-            about = (shape - shape[:, :1]) * per_px[:, None, None]
+        if camera.errors is None:  # the body stays as it is seen
             placed = dataclasses.replace(placed, joints=placed.joints[:, :1] + about @ rotation)
-    placed = _with_scale_of(source, placed, meta)
+    if camera.teller in (Teller.PICTURE, Teller.PERSON):
+        metric = placed.metric and camera.metric
+        placed = dataclasses.replace(placed, metric=metric, scale_source=camera.scale_source)
     if placed.scale is not None:
         meta["scale"] = dataclasses.asdict(placed.scale)
     body = Body(
@@ -116,7 +112,7 @@ def in_metres(
         metric=placed.metric,
         scale_source=placed.scale_source,
         camera_rotation=rotation,
-        camera_position=tracks.camera_position if frame == "world" else None,
+        camera_position=camera.position if frame == "world" else None,
         reprojection_px=np.linalg.norm(poses.in_image[..., :2] - keypoints.xy, axis=-1),
         covariance=_covariance(poses, per_px, rotation),
         meta=meta,
@@ -125,9 +121,9 @@ def in_metres(
         if body.covariance is not None:
             meta["covariance_about"] = "pelvis"
         return body
-    refined = _with_camera_of(source, refined, settings.adjuster.stature_std)
+    refined = _by_camera(refined, camera, settings.adjuster.stature_std)
     meta["calibration"], meta["covariance_about"] = refined.calibration, "origin"
-    camera = refined.rotation, refined.position
+    pose = refined.rotation, refined.position
     return dataclasses.replace(
         body,
         joints3d=np.ascontiguousarray(refined.joints),
@@ -135,34 +131,17 @@ def in_metres(
         scale_source="telemetry" if refined.metric else "assumed_height",
         camera_rotation=refined.rotation,
         camera_position=refined.position,
-        reprojection_px=reprojection_px(refined.joints, *camera, tracks.camera_matrix, keypoints.xy),
+        reprojection_px=reprojection_px(refined.joints, *pose, camera.matrix, keypoints.xy),
         covariance=refined.covariance,
     )
 
 
-def _alone(source: Source) -> bool:
-    """Whether the camera is known, its up is unsure, and the body stays as without a world."""
-    return isinstance(source, PictureWorld | SharedCamera) and source.config is None
-
-
-def _with_scale_of(source: Source, placed: WorldPoses, meta: dict[str, object]) -> WorldPoses:
-    """Placed poses with the source of their metres; ``meta`` gets the words about a camera from the picture."""
-    if isinstance(source, PictureWorld):
-        meta["camera"] = source.meta()
-        return dataclasses.replace(placed, metric=False, scale_source="assumed_height")
-    if isinstance(source, SharedCamera):
-        meta |= {} if source.words is None else {"camera": source.words}
-        return dataclasses.replace(placed, metric=placed.metric and source.metric, scale_source=source.scale_source)
-    return placed
-
-
-def _with_camera_of(source: Source, refined: RefinedWorld, stature_std: float) -> RefinedWorld:
-    """The adjusted world with what is known of its camera."""
-    if isinstance(source, PictureWorld):
-        return at_assumed_stature(refined, source, stature_std)
-    if isinstance(source, FusedTelemetry):
-        return with_fusion(refined, source)
-    return refined if source is None else source.holds(refined)
+def _by_camera(refined: RefinedWorld, camera: CameraPath, stature_std: float) -> RefinedWorld:
+    """The adjusted world with what is known of its camera beside the adjustment."""
+    if camera.teller is Teller.PERSON:
+        refined = held(refined, camera)
+    refined = with_measured(refined, camera)
+    return at_assumed_stature(refined, stature_std) if camera.teller is Teller.PICTURE else refined
 
 
 def _covariance(poses: ImagePoses, per_px: np.ndarray, rotation: np.ndarray) -> np.ndarray | None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.motion import Motion
 from drocap_ros.parameters import Values
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.poses import Progress
-from drocap_ros.reconstruction.reconstruct import reconstruct_with_camera
-from drocap_ros.reconstruction.shared_camera import SharedCamera
+from drocap_ros.reconstruction.reconstruct import solve
 from drocap_ros.tracks import Tracks
 
 
@@ -34,8 +35,14 @@ def reconstruct_people(
     """
     seen = {number: np.flatnonzero(np.isfinite(tracks.keypoints).any(axis=(1, 2))) for number, tracks in people.items()}
     first = max(people, key=lambda number: (len(seen[number]), -number))
-    settings = {"method": method, "initializer": initializer, "adjuster": adjuster, "progress": progress}
-    lead, camera = reconstruct_with_camera(people[first], **settings)  # type: ignore[arg-type]
+    settings: dict[str, Any] = {
+        "method": method,
+        "initializer": initializer,
+        "adjuster": adjuster,
+        "progress": progress,
+    }
+    found = solve(people[first], **settings)
+    lead, camera = found.motion, found.shared_camera
     motions: dict[int, Motion] = {}
     for number, tracks in people.items():
         rows = slice(int(seen[number][0]), int(seen[number][-1]) + 1)
@@ -44,14 +51,14 @@ def reconstruct_people(
     return motions
 
 
-def _other(tracks: Tracks, camera: SharedCamera | None, lead: Motion, settings: Mapping[str, object]) -> Motion:
+def _other(tracks: Tracks, camera: CameraPath | None, lead: Motion, settings: Mapping[str, Any]) -> Motion:
     """The motion of another person than the one with whom the camera was found, where it was."""
     if camera is None:
         tracks = dataclasses.replace(tracks, background=None)
         if "telemetry_rejected" in lead.meta:
             tracks = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
     else:
-        camera = camera.of_images(tracks.stamp_ns)
-    motion, _ = reconstruct_with_camera(tracks, camera=camera, **settings)  # type: ignore[arg-type]
+        camera = camera.of_images(np.searchsorted(camera.stamp_ns, tracks.stamp_ns))
+    motion = solve(tracks, shared_camera=camera, **settings).motion
     told: Values = {name: lead.meta[name] for name in ("camera", "telemetry_rejected") if name in lead.meta}
     return dataclasses.replace(motion, meta=motion.meta | told)

@@ -14,8 +14,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from drocap_ros.background import Background, PointHistory
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.camera_history import CameraHistory, WindowCamera
+from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.recording import session as recorded
 from drocap_ros.recording.pose_messages import add_calibration, add_state, fixed_points_from_message
 from drocap_ros.recording.session import Message, Session, header_stamp_ns, stamp_of
@@ -106,7 +107,7 @@ class RecordedCamera:
                 add_calibration(self._history, message)
         self.matrix: np.ndarray | None = None
 
-    def along(self, stamp_ns: np.ndarray, size: tuple[int, int], newest_ns: int) -> WindowCamera | None:
+    def along(self, stamp_ns: np.ndarray, size: tuple[int, int], newest_ns: int) -> CameraPath | None:
         """The camera at a window's images (F,) of a size, by the states up to that of the stamp ``newest_ns``."""
         self._states.go(newest_ns)
         camera = self._history.along(stamp_ns, size)

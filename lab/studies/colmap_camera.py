@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -10,6 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import log_so3
@@ -68,11 +68,14 @@ def colmap_study(clips: list[Path], models: Path) -> list[CameraRow]:
     for clip in clips:
         theirs = _colmap(clip)
         tracks, _ = read_input(clip, config, models)
-        camera = picture_camera(replace(tracks, camera_matrix=None))
+        camera = picture_camera(CameraPath(tracks.stamp_ns), tracks.background, tracks.image_size)
         assert camera is not None, clip
+        assert camera.picture is not None
+        assert camera.matrix is not None
+        facts, (rotation, _) = camera.picture, camera.pose
         assert len(tracks) == len(theirs.rotation), clip
         lag = round(_LAG_S * 1e9 / float(np.median(np.diff(tracks.stamp_ns))))
-        turned = camera.rotation[lag:] @ camera.rotation[:-lag].swapaxes(1, 2)
+        turned = rotation[lag:] @ rotation[:-lag].swapaxes(1, 2)
         other = theirs.rotation[lag:] @ theirs.rotation[:-lag].swapaxes(1, 2)
         both = np.isfinite(other).all(axis=(1, 2))
         off = _degrees(turned[both] @ other[both].swapaxes(1, 2))
@@ -80,9 +83,9 @@ def colmap_study(clips: list[Path], models: Path) -> list[CameraRow]:
             CameraRow(
                 clip.stem,
                 len(tracks),
-                camera.kind.name.lower(),
-                camera.residual_px,
-                camera.covered if camera.kind.known else 0.0,
+                facts.kind.name.lower(),
+                facts.residual_px,
+                facts.covered if facts.kind.known else 0.0,
                 float(np.isfinite(theirs.rotation[:, 0, 0]).mean()),
                 float(camera.matrix[0, 0]),
                 theirs.focal_px,

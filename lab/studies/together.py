@@ -11,7 +11,7 @@ from drocap_ros.evaluation.compare import world_errors
 from drocap_ros.evaluation.protocol import FPS, Progress, reported
 from drocap_ros.evaluation.world_protocol import WorldCase, world_view
 from drocap_ros.mocap import Sequence
-from drocap_ros.reconstruction.reconstruct import solve_view
+from drocap_ros.reconstruction.reconstruct import solve
 from drocap_ros.reconstruction.together.joined import join_views
 from drocap_ros.tracks import Tracks
 
@@ -52,7 +52,7 @@ def together_study(
 def _measure(sequence: Sequence, cases: tuple[WorldCase, WorldCase], seed: int) -> TogetherRow:
     first = world_view(sequence, cases[0], seed=seed)
     second = started_later(world_view(sequence, replace(cases[1], camera=1), seed=seed).tracks, LATER)
-    solved = [solve_view(first.tracks), solve_view(second)]
+    solved = [solve(first.tracks), solve(second)]
     alone = world_errors(solved[0].motion.joints3d, first.truth, FPS)
     motion = join_views(solved, ["first", "second"])[0]
     in_world = motion.frame == "world"

@@ -53,7 +53,12 @@ def single_causes(
     if not (np.abs(found.shared) > _CLEAR * found.shared_std).any():
         return []
     path = CameraTelemetry(found.rotation, found.position, given.fps)
-    data = PathInput(path, matrix, found.views, replace(config, tilt_deg=0.0, yaw_deg=0.0, latency_s=0.0, focal=0.0))
+    data = PathInput(
+        path,
+        matrix,
+        found.views,
+        replace(config, errors=replace(config.errors, tilt_deg=0.0, yaw_deg=0.0, latency_s=0.0), focal=0.0),
+    )
     knots, at_knots = data.knots, np.zeros(given.frames, bool)
     at_knots[knots.frame] = True
     views, kept = found.views.at_frames(at_knots)

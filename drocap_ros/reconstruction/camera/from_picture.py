@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraErrors, CameraPath, Kind, PictureFacts, Teller
 from drocap_ros.geometry.pinhole import centred_camera
 from drocap_ros.reconstruction.camera.growth import (
     LAST_STEPS,
@@ -16,7 +18,7 @@ from drocap_ros.reconstruction.camera.growth import (
     turns,
     with_ends,
 )
-from drocap_ros.reconstruction.camera.kinds import Kind, kind_of, turning_focal
+from drocap_ros.reconstruction.camera.kinds import kind_of, turning_focal
 from drocap_ros.reconstruction.camera.pairs import ENOUGH_PARALLAX, Pair, candidate_pairs
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
 from drocap_ros.reconstruction.camera.path_model import FOCAL, Knots, PathConfig, PathInput
@@ -50,30 +52,12 @@ _LARGEST_PX = 2.5
 _LEAST_FITTING = 0.4
 
 
-@dataclass(frozen=True)
-class PictureCamera:
-    """A camera of F frames, in a unit and axes of its own.
-
-    kind : what it does; the other fields count where that is known
-    rotation : (F, 3, 3) world -> camera; position : (F, 3), zeros where it does not move
-    matrix : (3, 3) px; focal_std : of the logarithm of the focal length, 0 = it was given
-    points : (J, 4) fixed points, x y z w
-    residual_px : median of the points' residuals; covered : share of the frames with enough points
-    position_std, turn_std_deg : of the path's change from knot to knot (an eighth of a second), in its unit, degrees
-    drift : (F, 2) standard deviations of position (its unit) and turn (rad) after the best similarity; None = unknown
-    """
+class _Start(NamedTuple):
+    """What is known before a path is sought: what the camera does, its matrix (3, 3) px, whose focal length errs so."""
 
     kind: Kind
-    rotation: np.ndarray
-    position: np.ndarray
     matrix: np.ndarray
     focal_std: float
-    points: np.ndarray
-    residual_px: float = float("nan")
-    covered: float = 0.0
-    position_std: float = float("nan")
-    turn_std_deg: float = float("nan")
-    drift: np.ndarray | None = None
 
 
 def camera_from_points(
@@ -84,8 +68,8 @@ def camera_from_points(
     frames: int,
     size: tuple[int, int],
     matrix: np.ndarray | None,
-) -> PictureCamera:
-    """The camera of evenly spaced frames.
+) -> CameraPath:
+    """The camera of evenly spaced frames, in a unit and axes of its own; its stamps are the frames' numbers.
 
     frame, track, point : (N,), (N,), (N, 2) px observations of fixed points; size : width, height px
     matrix : (3, 3) px, None = unknown
@@ -102,23 +86,27 @@ def camera_from_points(
         other = with_focal(matrix, turning_focal(sightings, matrix, key_hz))
         if kind_of(sightings, other, key_hz, size[0]) is Kind.TURNS:
             kind, matrix = Kind.TURNS, other
-    unknown = PictureCamera(
-        kind, np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), matrix, focal_std, np.zeros((0, 4))
-    )
-    if kind is Kind.STANDS:
-        return replace(unknown, residual_px=0.0, covered=1.0)
+    camera = _Start(kind, matrix, focal_std)
+    found: AdjustedPath | Kind = kind
     if kind is Kind.TURNS:
-        return _turning(sightings, unknown, fps)
-    return _moving(sightings, unknown, fps, key_hz) if kind is Kind.MOVES else unknown
+        found = _turning(sightings, camera, fps)
+    elif kind is Kind.MOVES:
+        found, camera = _moving(sightings, camera, fps, key_hz)
+    path = CameraPath(np.arange(frames), np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), camera.matrix)
+    path = replace(path, teller=Teller.PICTURE, metric=False, scale_source="assumed_height")
+    if isinstance(found, AdjustedPath):
+        return _with_facts(path, camera, found)
+    facts = PictureFacts(found, camera.focal_std)
+    return replace(path, picture=replace(facts, residual_px=0.0, covered=1.0) if kind is Kind.STANDS else facts)
 
 
-def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> PictureCamera:
-    """The path of a camera that moves: grown from a pair, or all at once where it moves little."""
+def _moving(sightings: Sightings, camera: _Start, fps: float, key_hz: float) -> tuple[AdjustedPath | Kind, _Start]:
+    """The path of a camera that moves, and its lens: grown from a pair, or all at once where it moves little."""
     every = _starts(sightings, camera, key_hz)
     # Rays through a wrong lens can meet behind the camera as well: such a path is turned inside out.
     starts = [start for start in every if start[1].behind < _BEHIND] or every
     if not starts:
-        return replace(camera, kind=Kind.NOTHING_FIXED)
+        return Kind.NOTHING_FIXED, camera
     least = min(start.path.residual_px for _, start in starts)
     small = None
     if starts[0][0] < _LITTLE_PARALLAX:
@@ -126,16 +114,16 @@ def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: flo
     if small is None or small.residual_px > _AS_GOOD * least:
         # Where there is little parallax any path fits: of starts that fit as well the one with the most of it counts.
         start = next(start for _, start in starts if start.path.residual_px <= _AS_GOOD * least)
-        grown = _grown(sightings, camera, start, fps)
-        if small is None and starts[0][0] < ENOUGH_PARALLAX and grown.residual_px > _WORSE * least:
+        grown, matrix = _grown(sightings, camera, start, fps)
+        grown_px = grown.residual_px if isinstance(grown, AdjustedPath) else float("inf")
+        if small is None and starts[0][0] < ENOUGH_PARALLAX and grown_px > _WORSE * least:
             small = _small_motion(sightings, camera, fps, _AS_GOOD * least)
-        if small is None or grown.residual_px <= small.residual_px:
-            return grown
-    of_path = replace(camera, rotation=small.rotation, position=small.position)
-    return _checked(of_path, small)
+        if small is None or grown_px <= small.residual_px:
+            return grown, camera._replace(matrix=matrix)
+    return small, camera
 
 
-def _small_motion(sightings: Sightings, camera: PictureCamera, fps: float, enough_px: float) -> AdjustedPath | None:
+def _small_motion(sightings: Sightings, camera: _Start, fps: float, enough_px: float) -> AdjustedPath | None:
     """The best path of a camera that moves little, of some that it may look down; the first one that fits."""
     best: AdjustedPath | None = None
     for horizon in _HORIZONS:
@@ -147,17 +135,16 @@ def _small_motion(sightings: Sightings, camera: PictureCamera, fps: float, enoug
     return best
 
 
-def _grown(sightings: Sightings, camera: PictureCamera, start: Growth, fps: float) -> PictureCamera:
-    """The path that grows from a start over all keyframes that can be placed."""
+def _grown(sightings: Sightings, camera: _Start, start: Growth, fps: float) -> tuple[AdjustedPath | Kind, np.ndarray]:
+    """The path that grows from a start over all keyframes that can be placed, and its matrix."""
     path = start.grow(len(sightings))
     found = adjusted(sightings, with_ends(sightings, path), fps, camera.focal_std, LAST_STEPS)
     if found is None or path.known.mean() < _LEAST_KNOWN:
-        return replace(camera, kind=Kind.FEW_POINTS, residual_px=float("inf"))
-    of_path = replace(camera, rotation=found.rotation, position=found.position, matrix=path.matrix)
-    return _checked(of_path, found)
+        return Kind.FEW_POINTS, camera.matrix
+    return found, path.matrix
 
 
-def _starts(sightings: Sightings, camera: PictureCamera, key_hz: float) -> list[tuple[float, Growth]]:
+def _starts(sightings: Sightings, camera: _Start, key_hz: float) -> list[tuple[float, Growth]]:
     """Paths of some keyframes about every promising pair, with its parallax (rad), those that tell most first."""
     growths: list[tuple[Pair, Growth]] = []
     enough = min(_COMPARED, int(_LEAST_KNOWN * len(sightings)))
@@ -173,43 +160,32 @@ def _starts(sightings: Sightings, camera: PictureCamera, key_hz: float) -> list[
     return [(pair.parallax, growth) for pair, growth in growths if growth.path.known.sum() >= enough]
 
 
-def _turning(sightings: Sightings, camera: PictureCamera, fps: float) -> PictureCamera:
+def _turning(sightings: Sightings, camera: _Start, fps: float) -> AdjustedPath | Kind:
     """The turns of a camera that keeps its place."""
     turned, place = turns(sightings, camera.matrix)
-    config = PathConfig(
-        tilt_deg=0.0,
-        yaw_deg=0.0,
-        latency_s=0.0,
-        focal=camera.focal_std,
-        position_wander_m=1e-6,
-        attitude_wander_deg=60.0,
-        jitter_m=1e-6,
-        jitter_deg=1.0,
-    )
+    errors = CameraErrors(0.0, 0.0, 0.0, position_wander_m=1e-6, attitude_wander_deg=60.0)
+    config = PathConfig(errors, focal=camera.focal_std, jitter_m=1e-6, jitter_deg=1.0)
     found = adjust_path(PathInput(CameraTelemetry(turned, place, fps), camera.matrix, sightings.views, config))
-    if found is None:
-        return replace(camera, kind=Kind.FEW_POINTS)
-    of_path = replace(camera, rotation=found.rotation, position=place)
-    return _checked(of_path, found)
+    return Kind.FEW_POINTS if found is None else replace(found, position=place)
 
 
-def _checked(camera: PictureCamera, found: AdjustedPath) -> PictureCamera:
+def _with_facts(path: CameraPath, camera: _Start, found: AdjustedPath) -> CameraPath:
     """The camera with what its adjustment tells, and whether it fits."""
     focal = float(np.exp(found.shared[FOCAL]))
     shape = None if found.posterior is None else found.posterior.shape
     steps = None if found.posterior is None else np.sqrt(np.diagonal(found.posterior.steps, axis1=1, axis2=2))
-    return replace(
-        camera,
-        kind=camera.kind if fits(found, camera.matrix) else Kind.NOTHING_FIXED,
-        matrix=with_focal(camera.matrix, focal),
+    facts = PictureFacts(
+        camera.kind if fits(found, camera.matrix) else Kind.NOTHING_FIXED,
         focal_std=float(np.hypot(found.shared_std[FOCAL], _LASTING_FOCAL_STD)) if camera.focal_std else 0.0,
         points=found.points,
         residual_px=found.residual_px,
         covered=found.covered,
         position_std=float("nan") if steps is None else float(np.median(steps[:, :3])),
         turn_std_deg=float("nan") if steps is None else float(np.degrees(np.median(steps[:, 3:]))),
-        drift=None if shape is None else _at_frames(shape, len(camera.rotation)),
+        drift=None if shape is None else _at_frames(shape, len(path.stamp_ns)),
     )
+    matrix = with_focal(camera.matrix, focal)
+    return replace(path, rotation=found.rotation, position=found.position, matrix=matrix, picture=facts)
 
 
 def _at_frames(values: np.ndarray, frames: int) -> np.ndarray:

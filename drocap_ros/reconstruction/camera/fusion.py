@@ -6,11 +6,13 @@ adjustment in the world starts from the corrected path, with the little that poi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.background import Background
+from drocap_ros.camera_path import CameraErrors, CameraPath, Teller
 from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.geometry.rotations import exp_so3, hat, log_so3, project_to_so3
@@ -34,9 +36,6 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, at
 from drocap_ros.reconstruction.world.even_capture import at_all_slots, capture_parts
 from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, turned_at_once
-from drocap_ros.reconstruction.world.world_model import WorldConfig
-from drocap_ros.reconstruction.world.world_residuals import WANDER_S
-from drocap_ros.tracks import Tracks
 
 #: Slots of one adjustment: two minutes at 24 Hz, which bounds memory; and those that neighbours share, ten seconds:
 #: where GPS wanders, two windows differ by some decimetres.
@@ -65,51 +64,45 @@ _HELD_DEG = 0.02
 _HELD_S = 0.001
 
 
-@dataclass(frozen=True)
-class FusedTelemetry:
-    """Telemetry after the correction; F images.
+class Fusion(NamedTuple):
+    """Reports after the correction.
 
-    tracks : with the corrected camera
-    covariance : (F, 6, 6) of the camera's position (m) and rotation (rad, camera axes)
-    config : of the adjustment in the world: what is left of the telemetry's errors
-    path : of the longest part, as adjusted
-    measured : JSON-compatible, of the longest part: constant errors and their standard deviations, that of the path's
-        mean position (xx, xy, xz, yy, yz, zz m^2), and the points
-    given : what the telemetry said of that part
+    camera : of all images; ``measured`` holds constant errors and their standard deviations, that of the path's mean
+        position (xx, xy, xz, yy, yz, zz m^2), and the points, all of the longest part
+    path : of that part, as adjusted; given : what the reports said of it
+    wander : standard deviations (m; degrees) of slow errors that change as those of that part do
     """
 
-    tracks: Tracks
-    covariance: np.ndarray
-    config: WorldConfig
-    measured: dict[str, Any]
+    camera: CameraPath
     path: AdjustedPath
     given: CameraTelemetry
+    wander: tuple[float, float]
 
 
 def fuse_telemetry(
-    tracks: Tracks, config: WorldConfig, known: np.ndarray | None = None
-) -> FusedTelemetry | Refusal | None:
-    """Correct the telemetry of tracks with a background; None = there is none of both, or the points are too few.
+    camera: CameraPath, points: Background | None, known: np.ndarray | None = None
+) -> Fusion | Refusal | None:
+    """Correct reports by fixed points; None = there is none of both, or the points are too few.
 
-    A refusal where no camera's path near the telemetry explains the points.  ``known`` : as of ``PathInput``.
+    A refusal where no camera's path near the reports explains the points.  ``known`` : as of ``PathInput``.
     """
-    rotation, position, points = tracks.camera_rotation, tracks.camera_position, tracks.background
-    if points is None or rotation is None or position is None or not refinable(tracks):
+    if points is None or not refinable(camera):
         return None
-    slot, fps = even_slots(tracks.stamp_ns)
+    rotation, position = camera.pose
+    slot, fps = even_slots(camera.stamp_ns)
     origin = position.mean(axis=0)
-    path = at_all_slots(without_steps(position, tracks.stamp_ns) - origin, slot)
+    path = at_all_slots(without_steps(position, camera.stamp_ns) - origin, slot)
     turn = project_to_so3(at_all_slots(rotation, slot))
     faded = _Faded(len(turn))
     best: tuple[AdjustedPath, CameraTelemetry] | None = None
-    for part in capture_parts(tracks.stamp_ns, slot):
+    for part in capture_parts(camera.stamp_ns, slot):
         # Points that contradict a part of a path lose their weight there: it would stay as reported.
         if refusal := frozen(turn[part], path[part], fps) or turned_at_once(turn[part], fps):
             return refusal
         for inside in windows(part.stop - part.start, _WINDOW, _OVERLAP):
             rows = slice(part.start + inside.start, part.start + inside.stop)
             given = CameraTelemetry(turn[rows], path[rows], fps)
-            found = _of_window(given, tracks, (slot, rows.start), config, known)
+            found = _of_window(given, (slot, rows.start), camera, points, known)
             if isinstance(found, Refusal) or found is None:
                 return found
             faded.add(rows, fade_weights(inside, part.stop - part.start, _OVERLAP), given, found)
@@ -117,37 +110,47 @@ def fuse_telemetry(
                 best = found, given
     assert best is not None  # a recording has a part, and it has a window
     change, covariance, steps = faded.mean()
+    wander = _wander(best[0].state, best[1], _errors(camera))
     corrected = replace(
-        tracks,
-        camera_rotation=(exp_so3(change[:, 3:]) @ turn)[slot],
-        camera_position=(path + change[:, :3])[slot] + origin,
+        camera,
+        rotation=(exp_so3(change[:, 3:]) @ turn)[slot],
+        position=(path + change[:, :3])[slot] + origin,
+        teller=Teller.POINTS_AND_REPORTS,
+        errors=_left(_errors(camera), steps),
+        covariance=covariance[slot],
+        corrected=True,
+        points_tell_up=True,
+        measured=_measured(*best, wander),
     )
-    return FusedTelemetry(corrected, covariance[slot], _left(config, steps), _measured(*best), *best)
+    return Fusion(corrected, *best, wander)
 
 
-def with_causes(fused: FusedTelemetry, config: WorldConfig) -> FusedTelemetry:
-    """The same, its measures with the single errors (``causes``) that explain most of what the points correct."""
-    assert fused.tracks.camera_matrix is not None
-    causes = single_causes(fused.given, fused.path, fused.tracks.camera_matrix, path_config(config))
-    return replace(fused, measured=fused.measured | {"causes": causes})
+def with_causes(fusion: Fusion, errors: CameraErrors) -> CameraPath:
+    """The camera, its measures with the single errors (``causes``) that explain most of what the points correct."""
+    camera = fusion.camera
+    assert camera.matrix is not None
+    causes = single_causes(fusion.given, fusion.path, camera.matrix, PathConfig(errors))
+    return replace(camera, measured={**(camera.measured or {}), "causes": causes})
+
+
+def _errors(camera: CameraPath) -> CameraErrors:
+    return camera.errors or CameraErrors()
 
 
 def _of_window(
     given: CameraTelemetry,
-    tracks: Tracks,
     slots: tuple[np.ndarray, int],
-    config: WorldConfig,
+    camera: CameraPath,
+    points: Background,
     known: np.ndarray | None,
 ) -> AdjustedPath | Refusal | None:
-    """The path of the tracks' slots (F,) from the first of some on; None = its points are too few."""
-    slot, begin = slots
-    points, matrix = tracks.background, tracks.camera_matrix
-    assert points is not None
+    """The path of the images' slots (F,) from the first of some on; None = its points are too few."""
+    (slot, begin), matrix = slots, camera.matrix
     assert matrix is not None
     frame = slot[points.frame] - begin
     inside = (frame >= 0) & (frame < given.frames)
     views = views_of(frame[inside], points.track[inside], points.point[inside], given.frames, given.fps)
-    found = _adjusted(PathInput(given, matrix, views, path_config(config), known))
+    found = _adjusted(PathInput(given, matrix, views, PathConfig(_errors(camera)), known))
     if not isinstance(found, AdjustedPath) or found.covered < _LEAST_COVERED:
         return found if isinstance(found, Refusal) else None
     if found.residual_px > _LARGEST_RESIDUAL * 1e-3 * float(matrix[0, 0]):
@@ -155,27 +158,15 @@ def _of_window(
     return found
 
 
-def path_config(config: WorldConfig) -> PathConfig:
-    """The errors that the adjustment in the world expects of a reported path, for that by points."""
-    return PathConfig(
-        tilt_deg=config.tilt_error_deg,
-        yaw_deg=config.yaw_error_deg,
-        latency_s=config.latency_std_s,
-        position_wander_m=config.position_wander_m,
-        attitude_wander_deg=config.attitude_wander_deg,
-        acceleration_m_s2=config.camera_acceleration_m_s2,
-    )
-
-
 def _adjusted(data: PathInput) -> AdjustedPath | Refusal | None:
     """The path by errors as they are expected, or by larger ones where the points show such.
 
     Errors that are expected to wander far would take the part of a constant yaw.
     """
-    given, own = data.path, data.config
+    given, own = data.path, data.config.errors
     if (state := rough_path(data)) is None:
         return None
-    position_m, attitude_deg = _wander(state, given)
+    position_m, attitude_deg = _wander(state, given, own)
     tilt_deg = float(np.degrees(np.abs(given.gimbal_axes()[[0, 2]] @ state.shared[MISALIGNMENT])).max())
     over = (
         position_m / own.position_wander_m,
@@ -188,23 +179,23 @@ def _adjusted(data: PathInput) -> AdjustedPath | Refusal | None:
             own,
             tilt_deg=max(own.tilt_deg, _WIDE_TILT_DEG),
             position_wander_m=position_m,
-            # An error that wanders leaves the line between two knots.
-            jitter_m=max(own.jitter_m, position_m * float(np.sqrt(0.5 / KNOTS_HZ / own.position_wander_s))),
             attitude_wander_deg=max(attitude_deg, _WIDE_ATTITUDE_DEG),
         )
-        data = replace(data, config=own)
+        # An error that wanders leaves the line between two knots.
+        jitter_m = max(data.config.jitter_m, position_m * float(np.sqrt(0.5 / KNOTS_HZ / own.position_wander_s)))
+        data = replace(data, config=replace(data.config, errors=own, jitter_m=jitter_m))
     found = adjust_path(data, state)
     if found is None or found.posterior is None:
         return None
     if not wide:
         return _without_latency(data, found)
-    left_deg = _wander(found.state, given)[1]
+    left_deg = _wander(found.state, given, own)[1]
     if left_deg > _LARGEST_TURN_DEG and found.covered >= _LEAST_COVERED:
         return Refusal(Why.POINTS_TURN_OTHERWISE, left_deg)
-    return _in_its_place(_without_latency(data, found), position_m, given)
+    return _in_its_place(_without_latency(data, found), own, given)
 
 
-def _in_its_place(found: AdjustedPath, expected_m: float, given: CameraTelemetry) -> AdjustedPath:
+def _in_its_place(found: AdjustedPath, expected: CameraErrors, given: CameraTelemetry) -> AdjustedPath:
     """The path with a place as uncertain as the wander that was found: points tell nothing of the mean error.
 
     The size of the errors is known by so many independent changes only, so the place has Student's distribution.  What
@@ -212,7 +203,8 @@ def _in_its_place(found: AdjustedPath, expected_m: float, given: CameraTelemetry
     """
     assert found.posterior is not None
     changes = 3.0 * max(given.frames / given.fps / _LAG_S, 1.0)
-    wider = max(_wander(found.state, given)[0] / expected_m, 1.0) ** 2 * changes / (changes - 2.0)
+    wander_m, _ = _wander(found.state, given, expected)
+    wider = max(wander_m / expected.position_wander_m, 1.0) ** 2 * changes / (changes - 2.0)
     place, pose = found.posterior.place, found.posterior.pose.copy()
     pose[:, :3, :3] += (wider - 1.0) * place
     return replace(found, posterior=found.posterior._replace(place=wider * place, pose=pose))
@@ -239,12 +231,14 @@ def _without_latency(data: PathInput, found: AdjustedPath) -> AdjustedPath:
     return again
 
 
-def _wander(found: PathState, given: CameraTelemetry) -> tuple[float, float]:
+def _wander(found: PathState, given: CameraTelemetry, expected: CameraErrors) -> tuple[float, float]:
     """Standard deviations (m; degrees) of slow errors that change as the found ones do."""
     errors = found.errors
     knots_hz = (len(errors) - 1) / max((given.frames - 1) / given.fps, 1e-9)
     lag = max(min(round(_LAG_S * knots_hz), len(errors) // 2), 1)
-    change = np.square(errors[lag:] - errors[:-lag]).mean(axis=0) / (2 * (1 - np.exp(-lag / knots_hz / WANDER_S)))
+    change = np.square(errors[lag:] - errors[:-lag]).mean(axis=0) / (
+        2 * (1 - np.exp(-lag / knots_hz / expected.wander_s))
+    )
     return float(np.sqrt(change[:3].mean())), float(np.degrees(np.sqrt(change[3:].mean())))
 
 
@@ -279,23 +273,22 @@ class _Faded:
         return change, covariance, steps[self._weight > 0.0].mean(axis=0)
 
 
-def _left(config: WorldConfig, steps: np.ndarray) -> WorldConfig:
-    """Priors of the adjustment in the world: the path's motion within a second is known to variances (6,)."""
-    wander = np.sqrt(0.5 * WANDER_S * steps)
+def _left(errors: CameraErrors, steps: np.ndarray) -> CameraErrors:
+    """What is left of them in the world: the path's motion within a second is known to variances (6,)."""
+    wander = np.sqrt(0.5 * errors.wander_s * steps)
     return replace(
-        config,
-        tilt_error_deg=_HELD_DEG,
-        yaw_error_deg=_HELD_DEG,
-        latency_std_s=_HELD_S,
+        errors,
+        tilt_deg=_HELD_DEG,
+        yaw_deg=_HELD_DEG,
+        latency_s=_HELD_S,
         position_wander_m=float(np.sqrt(np.square(wander[:3]).mean())),
         attitude_wander_deg=float(np.degrees(np.sqrt(np.square(wander[3:]).mean()))),
-        corrected=True,
     )
 
 
-def _measured(found: AdjustedPath, given: CameraTelemetry) -> dict[str, Any]:
+def _measured(found: AdjustedPath, given: CameraTelemetry, wander: tuple[float, float]) -> dict[str, object]:
     """JSON-compatible: the telemetry's errors as the points show them, in the terms of a calibration."""
-    axes, shared, wander = given.gimbal_axes(), found.shared, _wander(found.state, given)
+    axes, shared = given.gimbal_axes(), found.shared
     assert found.posterior is not None
     variance = axes @ found.posterior.shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
     return {
@@ -318,14 +311,15 @@ def _measured(found: AdjustedPath, given: CameraTelemetry) -> dict[str, Any]:
     }
 
 
-def with_fusion(refined: RefinedWorld, fused: FusedTelemetry) -> RefinedWorld:
-    """The adjusted world with what the points measured, and with the camera's own uncertainty in the joints'."""
-    # The place as a whole is the path's: the one of the adjustment has no more to say.
-    about = refined.covariance - refined.place[:, None]
-    place = np.broadcast_to(fused.measured["place_covariance_m2"], refined.place.shape)
-    calibration = [{**window, **fused.measured} for window in refined.calibration]
-    refined = replace(refined, place=place, covariance=about, calibration=calibration)
-    return with_camera_errors(refined, fused.covariance)
+def with_measured(refined: RefinedWorld, camera: CameraPath) -> RefinedWorld:
+    """The adjusted world with what points measured, and with the camera's own uncertainty in the joints'."""
+    if camera.measured is not None:
+        # The place as a whole is the path's: the one of the adjustment has no more to say.
+        about = refined.covariance - refined.place[:, None]
+        place = np.broadcast_to(np.array(camera.measured["place_covariance_m2"]), refined.place.shape)
+        calibration = [{**window, **camera.measured} for window in refined.calibration]
+        refined = replace(refined, place=place, covariance=about, calibration=calibration)
+    return refined if camera.covariance is None else with_camera_errors(refined, camera.covariance)
 
 
 def with_camera_errors(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraErrors
 from drocap_ros.geometry.rotations import exp_so3, log_so3
 from drocap_ros.reconstruction.camera.ground_plane import largest_plane
 from drocap_ros.reconstruction.camera.pairs import Pair
@@ -285,20 +286,19 @@ def small_motion(
     begin with, only depths that are about right.
     """
     path = CameraTelemetry(*turns(sightings, matrix), fps)
-    config = replace(free_config(1.0, focal_std), acceleration_m_s2=_SMALL_ACCELERATION, iterations=_SMALL_STEPS)
+    config = replace(free_config(1.0, focal_std, _SMALL_ACCELERATION), iterations=_SMALL_STEPS)
     return adjust_path(PathInput(path, matrix, sightings.views, config), horizon=horizon)
 
 
-def free_config(unit: float, focal_std: float) -> PathConfig:
-    """Priors of a path that nothing but its points holds; ``unit`` : usual distance of points, in the path's unit."""
+def free_config(unit: float, focal_std: float, acceleration: float | None = None) -> PathConfig:
+    """Priors of a path that nothing but its points holds.
+
+    unit : usual distance of points, in the path's unit, and its usual acceleration, where that is not given
+    """
+    position_wander, acceleration = 10.0 * unit, unit if acceleration is None else acceleration
     return PathConfig(
-        tilt_deg=0.0,
-        yaw_deg=0.0,
-        latency_s=0.0,
+        CameraErrors(0.0, 0.0, 0.0, position_wander, attitude_wander_deg=60.0, acceleration_m_s2=acceleration),
         focal=focal_std,
-        position_wander_m=10.0 * unit,
-        attitude_wander_deg=60.0,
-        acceleration_m_s2=unit,
         jitter_m=1e-3 * unit,
         jitter_deg=1.0,
     )

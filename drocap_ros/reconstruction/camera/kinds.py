@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from enum import Enum
-
 import numpy as np
 
+from drocap_ros.camera_path import Kind
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.sightings import Common, Sightings, rays, turn_between
 
@@ -29,23 +28,6 @@ _EXPLAINED = 0.5
 _MOST = 0.8
 #: Share of keyframes that see enough points, at least.
 _SEEING = 0.5
-
-
-class Kind(Enum):
-    """What the camera does; the value is a sentence's part for people."""
-
-    MOVES = "a camera that moves"
-    STANDS = "a camera that stands still"
-    TURNS = "a camera that turns in its place"
-    ZOOMS = "a camera that zooms: give a clip without a zoom"
-    FEW_POINTS = "too few fixed points: no texture, blur or water"
-    NOTHING_FIXED = "no points that stand still together: a crowd, leaves or water fill the picture"
-    CUT = "a cut in the clip: give one scene (--start, --end)"
-
-    @property
-    def known(self) -> bool:
-        """Whether the camera has a path."""
-        return self in (Kind.MOVES, Kind.STANDS, Kind.TURNS)
 
 
 def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int) -> Kind:

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraErrors
 from drocap_ros.reconstruction.camera.views import Views
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 
@@ -32,12 +33,7 @@ KNOTS_HZ = 8.0
 class PathConfig:
     """Expected errors of a given path; a standard deviation of 0 holds an unknown.
 
-    tilt_deg, yaw_deg : of the camera's constant errors, about the gimbal's axes
-    latency_s : of attitude and position, which have most of it in common
     focal : of the logarithm of the focal length
-    position_wander_m, attitude_wander_deg : of the slow errors, whose time constants are position_wander_s and
-        attitude_wander_s
-    acceleration_m_s2 : ordinary one of the camera, infinity = any
     jitter_m, jitter_deg : of the rest of each frame
     noise_px : of a point's coordinate
     views_per_fact : observations of a track, one per knot, that carry one independent piece of information, as errors
@@ -45,15 +41,8 @@ class PathConfig:
     iterations : most steps
     """
 
-    tilt_deg: float = 0.3
-    yaw_deg: float = 2.0
-    latency_s: float = 0.1
+    errors: CameraErrors = field(default_factory=CameraErrors)
     focal: float = 0.0
-    position_wander_m: float = 0.05
-    position_wander_s: float = 60.0
-    attitude_wander_deg: float = 0.1
-    attitude_wander_s: float = 10.0
-    acceleration_m_s2: float = 3.0
     jitter_m: float = 0.005
     jitter_deg: float = 0.2
     noise_px: float = 0.5

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraErrors
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian
 from drocap_ros.reconstruction.camera.path_model import (
     ATTITUDE_LATENCY,
@@ -23,7 +24,6 @@ from drocap_ros.reconstruction.camera.path_model import (
     MISALIGNMENT,
     POSITION_LATENCY,
     SHARED,
-    PathConfig,
     PathInput,
     PathState,
     tangents,
@@ -58,10 +58,10 @@ class PathWeights(NamedTuple):
 def weights_of(data: PathInput) -> PathWeights:
     """Weights from the expected errors."""
     config, step_s = data.config, data.knots.step_s
-    wander_s = np.repeat([config.position_wander_s, config.attitude_wander_s], 3)
-    first = np.repeat([config.position_wander_m, np.deg2rad(config.attitude_wander_deg)], 3) ** -2.0
-    keep = np.exp(-step_s / wander_s)
-    shared = expected_shared(config, data.path.gimbal_axes())
+    errors = config.errors
+    first = np.repeat([errors.position_wander_m, np.deg2rad(errors.attitude_wander_deg)], 3) ** -2.0
+    keep = np.exp(-step_s / errors.wander_s)
+    shared = expected_shared(errors, data.path.gimbal_axes(), config.focal)
     free = np.diag(shared) > 0.0
     if data.known is not None:
         shared = shared + np.where(free[:, None] & free, data.known, 0.0)
@@ -70,16 +70,16 @@ def weights_of(data: PathInput) -> PathWeights:
         keep=keep,
         change=fact * first / (1.0 - keep**2),
         first=fact * first,
-        acceleration=fact * (config.acceleration_m_s2 * step_s**2) ** -2.0,
+        acceleration=fact * (errors.acceleration_m_s2 * step_s**2) ** -2.0,
         shared=fact * shared,
         free=free,
     )
 
 
-def expected_shared(config: PathConfig, axes: np.ndarray) -> np.ndarray:
+def expected_shared(config: CameraErrors, axes: np.ndarray, focal: float = 0.0) -> np.ndarray:
     """(SHARED, SHARED) inverse covariance of the shared unknowns; rows and columns of held ones are zero.
 
-    axes : (3, 3) of the gimbal, rows in camera axes
+    axes : (3, 3) of the gimbal, rows in camera axes; focal : deviation of the logarithm of the focal length
     """
     turned = np.deg2rad([config.tilt_deg, config.yaw_deg, config.tilt_deg])
     covariance = np.zeros((SHARED, SHARED))
@@ -87,10 +87,10 @@ def expected_shared(config: PathConfig, axes: np.ndarray) -> np.ndarray:
     latencies = slice(ATTITUDE_LATENCY, POSITION_LATENCY + 1)
     own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
     covariance[latencies, latencies] = config.latency_s**2 * own
-    covariance[FOCAL, FOCAL] = config.focal**2
+    covariance[FOCAL, FOCAL] = focal**2
     free, shared = np.zeros(SHARED, bool), np.zeros((SHARED, SHARED))
     free[MISALIGNMENT] = min(config.tilt_deg, config.yaw_deg) > 0.0
-    free[latencies], free[FOCAL] = config.latency_s > 0.0, config.focal > 0.0
+    free[latencies], free[FOCAL] = config.latency_s > 0.0, focal > 0.0
     inside = np.ix_(free, free)
     shared[inside] = np.linalg.inv(covariance[inside])
     return shared

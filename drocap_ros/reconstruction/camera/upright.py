@@ -6,11 +6,12 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath, UpSource
 from drocap_ros.contacts import ANKLES, rest_likelihood
 from drocap_ros.reconstruction.camera.ground_plane import LEAST_ON_PLANE, LEAST_SHARE, largest_plane
 from drocap_ros.reconstruction.world.metric_scale import estimate_scale
@@ -51,31 +52,6 @@ _LEAST_STD_DEG = 0.5
 _ANKLE_M = 0.07
 
 
-class UpSource(Enum):
-    """What tells where up is."""
-
-    GROUND = "the plane of the ground's points under the feet"
-    FEET = "the plane of resting feet"
-    BODY = "the body's direction while it stands and walks"
-
-
-class Upright(NamedTuple):
-    """A path in metres, z up, the floor at z = 0: rotation (F, 3, 3) world -> camera, position (F, 3) m.
-
-    source, std_deg : of up; scale_std : of the logarithm of the path's scale, NaN = the camera keeps its place
-    feet_tell : resting feet measured it
-    points : (J, 4) x y z m, w
-    """
-
-    rotation: np.ndarray
-    position: np.ndarray
-    source: UpSource
-    std_deg: float
-    scale_std: float
-    feet_tell: bool
-    points: np.ndarray
-
-
 class PathScale(NamedTuple):
     """Metres per unit of a path, and the standard deviation of its logarithm."""
 
@@ -103,17 +79,17 @@ class _Plane(NamedTuple):
     covariance: np.ndarray
 
 
-def set_upright(
-    rotation: np.ndarray, position: np.ndarray, points: np.ndarray, seen: np.ndarray, stamp_ns: np.ndarray
-) -> Upright:
-    """The path in metres and upright.
+def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
+    """The path in metres, z up, the floor at z = 0, and its facts with what tells both.
 
     Parameters
     ----------
-    rotation, position : (F, 3, 3) world -> camera, (F, 3) in any unit and orientation
-    points : (J, 4) fixed points there, x y z w
+    camera : with facts of the picture, in any unit and orientation
     seen : (F, 17, 3) m, joints from the camera, in its axes, at the assumed stature
     """
+    (rotation, position), facts, stamp_ns = camera.pose, camera.picture, camera.stamp_ns
+    assert facts is not None
+    points = facts.points
     from_camera = seen @ rotation
     up, std_deg = body_up(from_camera)
     feet = from_camera[:, ANKLES]
@@ -143,7 +119,8 @@ def set_upright(
     moved = lying.copy()
     moved[:, :3] = (lying[:, :3] - lying[:, 3:] * origin) @ turn.T
     std = max(np.degrees(np.sqrt(0.5 * np.trace(plane.covariance))), _LEAST_STD_DEG)
-    return Upright(rotation @ turn.T, (path - origin) @ turn.T, source, float(std), factor_std, feet_tell, moved)
+    facts = replace(facts, points=moved, up=source, up_std_deg=float(std), scale_std=factor_std, feet_tell=feet_tell)
+    return replace(camera, rotation=rotation @ turn.T, position=(path - origin) @ turn.T, picture=facts)
 
 
 def _together(found: list[PathScale]) -> PathScale:

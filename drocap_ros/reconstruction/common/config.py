@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from drocap_ros.camera_path import CameraErrors
 from drocap_ros.geometry.pinhole import ASSUMED_FOCAL
 from drocap_ros.parameters import Parameters, param
 
@@ -137,3 +138,14 @@ class BundleAdjusterConfig(Parameters):
         maximum=20.0,
     )
     threads: int = param(1, "threads of the linear algebra; the matrices are small", minimum=1, maximum=64)
+
+    @property
+    def telemetry_errors(self) -> CameraErrors:
+        """Errors that are expected of the reported camera."""
+        return CameraErrors(
+            tilt_deg=self.telemetry_tilt_deg,
+            yaw_deg=self.telemetry_yaw_deg,
+            latency_s=self.telemetry_latency_s,
+            position_wander_m=self.telemetry_position_m,
+            attitude_wander_deg=self.telemetry_attitude_deg,
+        )

@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.background import Background
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.rotations import exp_so3, project_to_so3
-from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, path_config
+from drocap_ros.reconstruction.camera.fusion import Fusion, fuse_telemetry
 from drocap_ros.reconstruction.camera.path_model import ATTITUDE_LATENCY, MISALIGNMENT, POSITION_LATENCY
 from drocap_ros.reconstruction.camera.path_residuals import expected_shared
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
@@ -21,8 +23,6 @@ from drocap_ros.reconstruction.live.window import Retry
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, at_other_time
 from drocap_ros.reconstruction.world.even_capture import at_all_slots
 from drocap_ros.reconstruction.world.findings import Findings
-from drocap_ros.reconstruction.world.world_model import WorldConfig
-from drocap_ros.tracks import Tracks
 
 
 class Calibration(NamedTuple):
@@ -66,30 +66,31 @@ class FusedCamera:
         #: The largest errors (deg, m, deg) that points have shown, which later windows expect from the start.
         self._shown: np.ndarray = np.zeros(3)
 
-    def correct(self, tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refusal | None:
-        """The window's tracks with the corrected camera; the answers are those of ``fuse_telemetry``."""
-        rotation, position, (tilt_deg, place_m, turn_deg) = tracks.camera_rotation, tracks.camera_position, self._shown
-        if tracks.background is None or rotation is None or position is None:
+    def correct(self, camera: CameraPath, points: Background | None) -> Fusion | Refusal | None:
+        """The window's camera corrected; the answers are those of ``fuse_telemetry``."""
+        if points is None:
             return None
-        newest_ns = int(tracks.stamp_ns[-1])
+        assert camera.errors is not None
+        (rotation, position), (tilt_deg, place_m, turn_deg), stamp_ns = camera.pose, self._shown, camera.stamp_ns
+        newest_ns = int(stamp_ns[-1])
         if self._refusal is not None and not self._retry.due(newest_ns):
             return self._refusal
-        known = self._known if self._last is None else self._known.after(self._last[1], self._last[0], tracks.stamp_ns)
-        config = replace(
-            config,
-            tilt_error_deg=max(config.tilt_error_deg, float(tilt_deg)),
-            position_wander_m=max(config.position_wander_m, float(place_m)),
-            attitude_wander_deg=max(config.attitude_wander_deg, float(turn_deg)),
+        known = self._known if self._last is None else self._known.after(self._last[1], self._last[0], stamp_ns)
+        errors = replace(
+            camera.errors,
+            tilt_deg=max(camera.errors.tilt_deg, float(tilt_deg)),
+            position_wander_m=max(camera.errors.position_wander_m, float(place_m)),
+            attitude_wander_deg=max(camera.errors.attitude_wander_deg, float(turn_deg)),
         )
-        slot, fps = even_slots(tracks.stamp_ns)
+        slot, fps = even_slots(stamp_ns)
         rotation, position = project_to_so3(at_all_slots(rotation, slot)), at_all_slots(position, slot)
         given = CameraTelemetry(rotation, position, fps)
-        before = known.precision + expected_shared(path_config(config), given.gimbal_axes())
+        before = known.precision + expected_shared(errors, given.gimbal_axes())
         mean = _inverse(before) @ known.vector
         later = at_other_time(given, *mean[[ATTITUDE_LATENCY, POSITION_LATENCY]].tolist())
         turned = exp_so3(mean[None, MISALIGNMENT]) @ later.rotation
-        without = replace(tracks, camera_rotation=turned[slot], camera_position=later.position[slot])
-        fused = fuse_telemetry(without, config, known.precision)
+        without = replace(camera.moved(turned[slot], later.position[slot]), errors=errors)
+        fused = fuse_telemetry(without, points, known.precision)
         self._refusal = None
         if isinstance(fused, Refusal) and fused.why in (Why.POINTS_MOVE_OTHERWISE, Why.POINTS_TURN_OTHERWISE):
             self._retry.failed(newest_ns)
@@ -100,11 +101,10 @@ class FusedCamera:
         self._retry = Retry()
         precision, vector = fused.path.facts
         self._known = known
-        self._last = tracks.stamp_ns, Findings(precision, vector + precision @ mean)
+        self._last = stamp_ns, Findings(precision, vector + precision @ mean)
         self.calibration = Calibration(mean + fused.path.shared, _inverse(before + precision), given.gimbal_axes())
-        points, tilt = fused.measured["background"], self.calibration.gimbal_deg[[0, 2]]
-        shown = 0.5 * np.abs(tilt).max(), points["position_wander_m"], points["attitude_wander_deg"]
-        self._shown = np.maximum(self._shown, shown)
+        tilt = self.calibration.gimbal_deg[[0, 2]]
+        self._shown = np.maximum(self._shown, (0.5 * np.abs(tilt).max(), *fused.wander))
         return fused
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.geometry.camera_history import WindowCamera
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.live.window import AdjustedWindow
@@ -75,7 +75,7 @@ class LatestPlace:
         self._solution, self._begin_ns = solution, stamp_ns
 
     def place(
-        self, stamp_ns: int, pose: tuple[np.ndarray, np.ndarray], keypoints: np.ndarray, camera: WindowCamera | None
+        self, stamp_ns: int, pose: tuple[np.ndarray, np.ndarray], keypoints: np.ndarray, camera: CameraPath | None
     ) -> PlacedPose | None:
         """The image's pose in ``map``; None without a solution there, the camera's pose or enough keypoints.
 
@@ -90,11 +90,13 @@ class LatestPlace:
         if camera is None or not camera.known[0] or not np.isfinite(joints).all() or seen.sum() < MIN_JOINTS:
             return None
         solution = self._blended(stamp_ns) if self._solution is not None else _UNSOLVED
-        rotation: np.ndarray = exp_so3(solution.correction[None, 3:])[0] @ camera.rotation[0]
-        position = camera.position[0] + solution.correction[:3]
+        (turn, place), matrix = camera.pose, camera.matrix
+        assert matrix is not None
+        rotation: np.ndarray = exp_so3(solution.correction[None, 3:])[0] @ turn[0]
+        position = place[0] + solution.correction[:3]
         body = joints @ rotation
-        ray = np.column_stack([keypoints[seen] - camera.matrix[:2, 2], np.full(seen.sum(), 1.0)])
-        ray[:, :2] /= np.diagonal(camera.matrix)[:2]
+        ray = np.column_stack([keypoints[seen] - matrix[:2, 2], np.full(seen.sum(), 1.0)])
+        ray[:, :2] /= np.diagonal(matrix)[:2]
         ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)) @ rotation
         across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
         target = (across @ (position - body[seen])[..., None])[..., 0]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.ellipsoids import pack_covariance, unpack_covariance
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
@@ -23,14 +24,13 @@ from drocap_ros.reconstruction.live.picture_odometry import (
     camera_there,
     own_covariance,
 )
-from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Window, camera_path
+from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Window
 from drocap_ros.reconstruction.live.world_chain import WorldChain
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import place_in_world
 from drocap_ros.reconstruction.world.refine import RefinedWorld
-from drocap_ros.reconstruction.world.world_model import world_config
+from drocap_ros.reconstruction.world.world_model import config_of, world_config
 from drocap_ros.skeleton import BODY_17, indices
-from drocap_ros.tracks import Tracks
 
 #: Time (s) at a window's end in which the person's place there is compared with that in another one.
 _NEWEST_S = 1.5
@@ -47,7 +47,7 @@ class PictureWindows:
         self._length_ns = round(config.world_window_s * 1e9)
         self._odometry, self._chain = PictureOdometry(), WorldChain()
         self._of: tuple[int, int, int] | None = None  # subject, path and corrections of the chain
-        self._last: tuple[AdjustedWindow, Tracks] | None = None  # in `odom`, with its path
+        self._last: tuple[AdjustedWindow, CameraPath] | None = None  # in `odom`, with its path
 
     def adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
         """The window's result in ``odom``, or that in the camera's axes with the reason.
@@ -65,11 +65,10 @@ class PictureWindows:
         use = slice(first, seeing[-1] + 1 if len(seeing) else len(w.stamp_ns))
         if use.stop - first < LEAST_VIEWS:
             return replace(camera_result, picture=self._odometry.lost)
-        tracks = _tracks(w.frames(use))
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
         had = self._odometry.losses
         person = Person(poses, w.height_m, w.subject)
-        path = self._odometry.follow(tracks, person, self._config)
+        path = self._odometry.follow(w.frames(use), person)
         lost, why = self._odometry.losses > had, self._odometry.lost
         if path is None:
             return replace(camera_result, picture=why, lost=lost)
@@ -78,7 +77,7 @@ class PictureWindows:
         if before != of:
             self._of, self._chain = of, WorldChain()
         if last is not None and before is not None and before[1:] != of[1:]:
-            path = self._odometry.moved(*_onward(*last, path.tracks, person if same else None))
+            path = self._odometry.moved(*_onward(*last, path.camera, person if same else None))
         placed = self._placed(path, person, w.keypoints[use], camera_result, use)
         if last is not None and same and before != of:
             # A path begins or is corrected about the person, whom both windows see.
@@ -88,33 +87,33 @@ class PictureWindows:
             assert placed.in_map is not None
             there = placed.in_map._replace(position=placed.in_map.position + by)
             placed = replace(placed, joints3d=placed.joints3d + by, in_map=there)
-        self._last = placed, path.tracks
+        self._last = placed, path.camera
         return replace(placed, picture=f"{path.words}; {why}" if lost else path.words, lost=lost)
 
     def _placed(
         self, path: PicturePath, person: Person, keypoints: Keypoints2D, seen: AdjustedWindow, use: slice
     ) -> AdjustedWindow:
         """The window's images ``use``, those of the path, in ``odom``; ``seen`` : all of it in camera axes."""
-        poses, tracks, config = person.poses, path.tracks, path.world.config
-        rotation, position = camera_path(tracks)
-        per_px = person.metres_per_px(tracks)
+        poses, camera = person.poses, path.camera
+        rotation, position = camera.pose
+        per_px = person.metres_per_px(camera)
         refined = None
-        if config is not None:
-            config = self._chain.steps(config, tracks.stamp_ns)
-            refined = self._chain.refined(tracks, keypoints, poses, per_px, config)
+        if camera.errors is not None:
+            config = self._chain.steps(config_of(camera, self._config), camera.stamp_ns)
+            refined = self._chain.refined(camera, keypoints, poses, per_px, config)
         if isinstance(refined, RefinedWorld):
             joints, covariance = refined.joints, unpack_covariance(refined.covariance)
             rotation, position = refined.rotation, refined.position
         else:
             # Up is unsure: the body is as without a world, placed at its pelvis.
-            placed = place_in_world(in_camera_axes(poses, per_px), poses.in_image[..., :2], per_px, tracks).joints
+            placed = place_in_world(in_camera_axes(poses, per_px), poses.in_image[..., :2], per_px, camera).joints
             joints = placed[:, :1] + seen.joints3d[use] @ rotation
             turned = rotation[:, None]
             covariance = np.swapaxes(turned, -1, -2) @ unpack_covariance(seen.covariance[use]) @ turned
         covariance = covariance + own_covariance(path, joints, self._config.stature_std)
         return replace(
             seen,
-            stamp_ns=tracks.stamp_ns,
+            stamp_ns=camera.stamp_ns,
             joints3d=joints,
             covariance=pack_covariance(covariance),
             confidence=seen.confidence[use],
@@ -123,16 +122,18 @@ class PictureWindows:
         )
 
 
-def _onward(last: AdjustedWindow, theirs: Tracks, ours: Tracks, same: Person | None) -> tuple[np.ndarray, np.ndarray]:
+def _onward(
+    last: AdjustedWindow, theirs: CameraPath, ours: CameraPath, same: Person | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Turn (3, 3) about the vertical and way (3,) m across it, by which a path goes on from the last window's.
 
     In the images of both the camera is where it was.  Where there are none, the ``same`` person faces as before, and
     the camera begins where the other path ended.
     """
-    (rotation, position), both = camera_path(ours), camera_there(theirs, ours.stamp_ns)
+    (rotation, position), both = ours.pose, camera_there(theirs, ours.stamp_ns)
     shared = len(both.image) > 0
     if not shared:
-        both = Held(np.zeros(1, int), *(values[-1:] for values in camera_path(theirs)))
+        both = Held(np.zeros(1, int), *(values[-1:] for values in theirs.pose))
     turned = np.einsum("fki,fkj->ij", both.rotation, rotation[both.image])
     yaw = float(np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1]))
     if same is not None and not shared:
@@ -166,15 +167,3 @@ def _beside(last: AdjustedWindow, placed: AdjustedWindow) -> np.ndarray:
     passed_s = ours_s[both] if both.any() else _SPEED_S * (1.0 - np.exp(-ours_s[:1] / _SPEED_S))
     ours = placed.joints3d[both if both.any() else slice(1), 0, :2]
     return np.append((place + passed_s[:, None] * speed - ours).mean(axis=0), 0.0)
-
-
-def _tracks(w: Window) -> Tracks:
-    keypoints = w.keypoints
-    return Tracks(
-        keypoints=keypoints.xy,
-        joints=BODY_17.joints,
-        stamp_ns=w.stamp_ns,
-        image_size=w.image_size,
-        camera_matrix=None if w.camera is None else w.camera.matrix,
-        background=w.background,
-    )

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.background import Background
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
@@ -47,7 +47,7 @@ def live_poses(
     initializer: InitializerConfig,
     adjuster: BundleAdjusterConfig,
     effort_at: Callable[[int], Effort | None] | None = None,
-    camera_at: Callable[[np.ndarray, tuple[int, int]], WindowCamera | None] | None = None,
+    camera_at: Callable[[np.ndarray, tuple[int, int]], CameraPath | None] | None = None,
     points_at: Callable[[np.ndarray], Background | None] | None = None,
 ) -> Iterator[LivePose | LiveWindow]:
     """Poses and windows in the order of the live graph; memory is that of one window.

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.background import Background
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
-from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.tracks import Tracks
 
 #: Share of the allowed time above which the next window gets coarser: a tenth is left for its spread.
 _TOO_LONG = 0.9
@@ -38,7 +37,7 @@ class Window(NamedTuple):
     keypoints: Keypoints2D
     initial_joints: np.ndarray
     subject: int = 0
-    camera: WindowCamera | None = None
+    camera: CameraPath | None = None
     assumed_focal_px: float | None = None
     background: Background | None = None
     image_size: tuple[int, int] = (0, 0)
@@ -55,7 +54,7 @@ class Window(NamedTuple):
 
     def frames(self, use: slice) -> Window:
         """Some of the frames."""
-        camera = None if self.camera is None else self.camera.frames(use)
+        camera = None if self.camera is None else self.camera.of_images(use)
         kept = np.arange(len(self.stamp_ns))[use]
         return self._replace(
             background=None if self.background is None else self.background.of_frames(kept),
@@ -173,10 +172,3 @@ class AdjustedWindow:
     picture: str = ""
     lost: bool = False
     in_map: InMap | None = None
-
-
-def camera_path(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (F, 3, 3) world -> camera and positions (F, 3) m of tracks that have a camera's path."""
-    assert tracks.camera_rotation is not None
-    assert tracks.camera_position is not None
-    return tracks.camera_rotation, tracks.camera_position

@@ -11,16 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.refusal import Refusal
-from drocap_ros.reconstruction.live.window import camera_path
 from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.refine import Before, RefinedWorld
 from drocap_ros.reconstruction.world.world_model import WorldConfig
-from drocap_ros.tracks import Tracks
 
 #: Share of a recording's steps that lock feet, and of all steps of a window that continues another, as its inverse:
 #: what more steps would change, the next window does, half a second later.
@@ -32,7 +31,7 @@ class _Last(NamedTuple):
 
     before: Before
     found: Findings
-    tracks: Tracks
+    camera: CameraPath
 
 
 class WorldChain:
@@ -53,8 +52,8 @@ class WorldChain:
     def move(self, by: np.ndarray) -> None:
         """The last window lies (3,) m beside where it was, and the next one continues it there."""
         if self._last is not None:
-            before, found, tracks = self._last
-            there = replace(tracks, camera_position=camera_path(tracks)[1] + by)
+            before, found, camera = self._last
+            there = replace(camera, position=camera.pose[1] + by)
             self._last = _Last(before._replace(joints=before.joints + by), found, there)
 
     def steps(self, config: WorldConfig, stamp_ns: np.ndarray) -> WorldConfig:
@@ -68,7 +67,7 @@ class WorldChain:
 
     def refined(
         self,
-        tracks: Tracks,
+        camera: CameraPath,
         keypoints: Keypoints2D,
         poses: ImagePoses,
         per_px: np.ndarray,
@@ -76,12 +75,12 @@ class WorldChain:
         extra: Findings | None = None,
     ) -> RefinedWorld | Refusal | None:
         """The next window in the world; None = too short.  ``extra`` : priors of this window alone."""
-        known = self._prior(tracks.stamp_ns)
+        known = self._prior(camera.stamp_ns)
         every = known if extra is None else known.later(extra, 1.0, 0.0)
-        found = in_world(tracks, keypoints, poses, per_px, config, every, self._before_in(tracks))
+        found = in_world(camera, keypoints, poses, per_px, config, every, self._before_in(camera))
         if found.refined is None:
             return found.refusal
-        self._known, self._last = known, _Last(found.refined.before, found.refined.found, tracks)
+        self._known, self._last = known, _Last(found.refined.before, found.refined.found, camera)
         return found.refined
 
     def _continued(self, stamps: np.ndarray) -> _Last | None:
@@ -96,15 +95,15 @@ class WorldChain:
             else self._known.after(self._last.found, self._last.before.stamp_ns, stamps)
         )
 
-    def _before_in(self, tracks: Tracks) -> Before | None:
-        """The window that these tracks continue, with its slow errors as those of their camera."""
-        last = self._continued(tracks.stamp_ns)
+    def _before_in(self, camera: CameraPath) -> Before | None:
+        """The window that this one continues, with its slow errors as those of this camera."""
+        last = self._continued(camera.stamp_ns)
         if last is None:
             return None
-        before, theirs = last.before, last.tracks
+        before = last.before
         wander = before.wander.copy()
-        at, here = (np.isin(a, b) for a, b in itertools.permutations((before.stamp_ns, tracks.stamp_ns)))
-        (turn, place), (their_turn, their_place) = camera_path(tracks), camera_path(theirs)
+        at, here = (np.isin(a, b) for a, b in itertools.permutations((before.stamp_ns, camera.stamp_ns)))
+        (turn, place), (their_turn, their_place) = camera.pose, last.camera.pose
         wander[at, :3] += their_place[at] - place[here]
         wander[at, 3:] += log_so3(their_turn[at] @ np.swapaxes(turn[here], 1, 2))
         return before._replace(wander=wander)

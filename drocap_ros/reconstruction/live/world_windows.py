@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
-from drocap_ros.background import Background
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.contacts import ANKLES
-from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
-from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, with_fusion
+from drocap_ros.reconstruction.camera.fusion import Fusion, with_measured
 from drocap_ros.reconstruction.camera.upright import FEET_HZ, by_ground
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
@@ -21,7 +18,7 @@ from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.method import WindowSolution
 from drocap_ros.reconstruction.live.fused_camera import FusedCamera
-from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, TelemetryUse, Window, camera_path
+from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, TelemetryUse, Window
 from drocap_ros.reconstruction.live.world_chain import WorldChain
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.findings import Findings
@@ -29,9 +26,7 @@ from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
 from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.reconstruction.world.telemetry_checks import stopped, unchanged
-from drocap_ros.reconstruction.world.world_model import world_config
-from drocap_ros.skeleton import BODY_17
-from drocap_ros.tracks import Tracks
+from drocap_ros.reconstruction.world.world_model import config_of, world_config
 
 #: Time (s) for which the newest images may lack a reported pose: states of the vehicle arrive later than images.
 _LATE_S = 0.5
@@ -80,13 +75,14 @@ class WorldWindows:
         use = self._frames(w)
         if use is None:
             return replace(camera_result, telemetry=TelemetryUse.LATE)
-        camera, stamps, keypoints = w.camera.frames(use), w.stamp_ns[use], w.keypoints[use]
-        self._moved |= not unchanged(camera.rotation, camera.position).all()
-        if self._moved and (refusal := stopped(camera.rotation, camera.position, stamps)):
+        height_m, w = w.height_m, w.frames(use)
+        assert w.camera is not None
+        camera, stamps = replace(w.camera, errors=self._config.errors), w.stamp_ns
+        self._moved |= not unchanged(*camera.pose).all()
+        if self._moved and (refusal := stopped(*camera.pose, stamps)):
             return self._refused(camera_result, refusal)
-        reported = _tracks(stamps, keypoints, camera, None if w.background is None else w.frames(use).background)
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
-        refined = self._refined(reported, keypoints, poses, w.height_m)
+        refined = self._refined(camera, w, poses, height_m)
         if isinstance(refined, Refusal):
             return self._refused(camera_result, refined)
         if refined is None:
@@ -101,30 +97,29 @@ class WorldWindows:
             confidence=camera_result.confidence[use],
             reprojection_rms_px=camera_result.reprojection_rms_px[use],
             telemetry=TelemetryUse.USED,
-            in_map=InMap(refined.rotation, refined.position, _correction(refined, reported)),
+            in_map=InMap(refined.rotation, refined.position, _correction(refined, camera)),
             calibration=str(self._fused.calibration) if self._by_points else "",
         )
 
     def _refined(
-        self, reported: Tracks, keypoints: Keypoints2D, poses: ImagePoses, height_m: float
+        self, camera: CameraPath, w: Window, poses: ImagePoses, height_m: float
     ) -> RefinedWorld | Refusal | None:
         """The window in the world, by its fixed points too where there are enough; None = too short."""
-        stamps = reported.stamp_ns
-        fused = self._fused.correct(reported, self._config)
+        stamps = camera.stamp_ns
+        fused = self._fused.correct(camera, w.background)
         if isinstance(fused, Refusal):
             return fused
         if self._by_points != (fused is not None):  # the camera's reports have other errors now
             self._chain.of_scale(stamps)
             self._by_points = fused is not None
-        tracks, config, extra = reported, self._config, None
+        per_px = metres_per_px(true_shape(poses.in_image, camera.matrix), stamps, height_m)
+        config, extra = self._config, None
         if fused is not None:
             # Feet need not tell whether the reports are true: points have.
-            tracks, config = fused.tracks, replace(fused.config, checks=False)
-        per_px = metres_per_px(true_shape(poses.in_image, tracks.camera_matrix), stamps, height_m)
-        if fused is not None:
-            extra = _ground(fused, poses, per_px)
-        refined = self._chain.refined(tracks, keypoints, poses, per_px, self._chain.steps(config, stamps), extra)
-        return with_fusion(refined, fused) if fused is not None and isinstance(refined, RefinedWorld) else refined
+            camera, config, extra = fused.camera, replace(config, checks=False), _ground(fused, poses, per_px)
+        config = self._chain.steps(config_of(camera, config), stamps)
+        refined = self._chain.refined(camera, w.keypoints, poses, per_px, config, extra)
+        return with_measured(refined, camera) if isinstance(refined, RefinedWorld) else refined
 
     def _refused(self, camera_result: AdjustedWindow, refusal: Refusal) -> AdjustedWindow:
         self._chain.begin()
@@ -144,31 +139,15 @@ class WorldWindows:
         return slice(begin, end)
 
 
-def _tracks(
-    stamp_ns: np.ndarray, keypoints: Keypoints2D, camera: WindowCamera, background: Background | None
-) -> Tracks:
-    return Tracks(
-        keypoints=keypoints.xy,
-        joints=BODY_17.joints,
-        stamp_ns=stamp_ns,
-        # The size of the images is unknown here, and not used.
-        image_size=(math.ceil(camera.matrix[0, 0]), math.ceil(camera.matrix[1, 1])),
-        camera_rotation=camera.rotation,
-        camera_position=camera.position,
-        camera_matrix=camera.matrix,
-        background=background,
-    )
-
-
-def _ground(fused: FusedTelemetry, poses: ImagePoses, per_px: np.ndarray) -> Findings:
+def _ground(fused: Fusion, poses: ImagePoses, per_px: np.ndarray) -> Findings:
     """The scale at which feet stand on the plane of points.
 
     It errs alike in every window of a person, and is not carried on.
     """
-    tracks, path = fused.tracks, fused.path
-    here = replace(tracks, camera_position=np.zeros((len(tracks), 3)))
+    camera, path = fused.camera, fused.path
+    here = replace(camera, position=np.zeros((len(camera.stamp_ns), 3)))
     seen = place_in_world(in_camera_axes(poses, per_px), poses.in_image[..., :2], per_px, here).joints
-    slot, fps = even_slots(tracks.stamp_ns)
+    slot, fps = even_slots(camera.stamp_ns)
     level = by_ground(np.array([0.0, 0.0, 1.0]), seen[:, ANKLES], path.position[slot], path.points)
     found = Findings.unknown()
     if level is not None:
@@ -178,7 +157,7 @@ def _ground(fused: FusedTelemetry, poses: ImagePoses, per_px: np.ndarray) -> Fin
     return found
 
 
-def _correction(refined: RefinedWorld, tracks: Tracks) -> np.ndarray:
-    rotation, position = camera_path(tracks)
+def _correction(refined: RefinedWorld, camera: CameraPath) -> np.ndarray:
+    rotation, position = camera.pose
     turned = refined.rotation[-1:] @ np.swapaxes(rotation[-1:], 1, 2)
     return np.concatenate([refined.position[-1] - position[-1], log_so3(turned)[0]])

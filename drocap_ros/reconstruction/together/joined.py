@@ -16,7 +16,7 @@ from drocap_ros.geometry.ellipsoids import pack_covariance, unpack_covariance
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.in_metres import reprojection_px
-from drocap_ros.reconstruction.reconstruct import SolvedView
+from drocap_ros.reconstruction.reconstruct import Solved
 from drocap_ros.reconstruction.together.placement import Placement, follow_view, place_view
 from drocap_ros.reconstruction.together.problem import JoinedProblem
 from drocap_ros.reconstruction.together.timing import TimeOffset, time_offsets
@@ -32,8 +32,8 @@ _SAME_ORIGIN_M, _SAME_NORTH_DEG = 4.0, 10.0
 _SAME_WORLD = Placement(1.0, np.eye(3), np.zeros(3), 0.0)
 
 
-def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> list[Motion]:
-    """One body from several recordings of one person, each solved alone, by so many threads.
+def join_views(solved: list[Solved], names: list[str]) -> list[Motion]:
+    """One body from several recordings of one person, each solved alone.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def join_views(solved: list[SolvedView], names: list[str], threads: int = 1) -> 
     moved = [view.moved(p.scale, p.rotation, p.translation) for view, (_, p) in zip(views, fits, strict=True)]
     at_rest = views[home].own_world or not any(p.moves for _, p in fits)
     problem = JoinedProblem(moved, home, offsets, at_rest)
-    with blas_threads(threads):
+    with blas_threads(solved[0].settings.adjuster.threads):
         refined = problem.with_home_errors(problem.solve())
         return _results(problem, refined, names)
 
@@ -123,7 +123,7 @@ def _results(problem: JoinedProblem, refined: RefinedWorld, names: list[str]) ->
             camera_rotation=rotation,
             confidence=seen,
             keypoints=keypoints,
-            reprojection_px=reprojection_px(joints, rotation, position, view.matrix, keypoints),
+            reprojection_px=reprojection_px(joints, rotation, position, view.camera.matrix, keypoints),
             meta={**alone, **calibration, "frames": len(rows), "together": together},
             camera_position=position / scale,
             covariance=refined.covariance[rows] / scale**2,

@@ -44,7 +44,7 @@ class JoinedProblem:
         self.views = views if at_rest else [replace(v, config=replace(v.config, feet=False)) for v in views]
         self.home, self.offsets, self.at_rest = home, offsets, at_rest
         self.offset_std = [0.0] * len(views)
-        slot, _ = even_slots(views[0].solved.tracks.stamp_ns)
+        slot, _ = even_slots(views[0].camera.stamp_ns)
         self._slot = slot
         self._time = np.interp(np.arange(slot[-1] + 1), slot, views[0].time_s)
         self._joints: np.ndarray | None = None
@@ -70,7 +70,7 @@ class JoinedProblem:
     def with_home_errors(self, refined: RefinedWorld) -> RefinedWorld:
         """The result whose joints are as uncertain as the camera whose world it is, too."""
         home = self.views[self.home]
-        errors = home.solved.camera_covariance
+        errors = home.errors
         if errors is None:
             return refined
         near = np.searchsorted(home.time_s, self.views[0].time_s - self.offsets[self.home])
@@ -135,12 +135,11 @@ class JoinedProblem:
     def _adjust(self, inputs: list[WorldInput], start: np.ndarray) -> RefinedWorld:
         """One adjustment."""
         first = self.views[0]
-        tracks = replace(first.solved.tracks, camera_rotation=first.turn, camera_position=first.path)
         # Bones between joints that err are too long: those of the bodies that single views give.
         lengths = np.mean([np.median(span_lengths(view.joints), axis=0) for view in self.views], axis=0)
         beside = Beside(tuple(inputs[1:]), inputs[0].placed_m, inputs[0].placed_deg, lengths)
         found = refine_in_world(
-            tracks, first.solved.keypoints, first.placed_poses(start), inputs[0].config, beside=beside
+            first.camera, first.solved.keypoints, first.placed_poses(start), inputs[0].config, beside=beside
         )
         assert not isinstance(found, Refusal)
         return found
@@ -155,12 +154,12 @@ class JoinedProblem:
 
     def images(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Stamps (G,) ns, on its own clock, of the first view's images while a view records, and their numbers."""
-        view, own = self.views[number], self.views[0].solved.tracks.stamp_ns
+        view, own = self.views[number], self.views[0].camera.stamp_ns
         if number == 0:
             return own, np.arange(len(own))
         there = self.views[0].time_s - self.offsets[number]
         rows = np.flatnonzero((there >= 0.0) & (there <= view.time_s[-1]))
-        return view.solved.tracks.stamp_ns[0] + np.round(there[rows] * 1e9).astype(np.int64), rows
+        return view.camera.stamp_ns[0] + np.round(there[rows] * 1e9).astype(np.int64), rows
 
     def shown(self, number: int, view: WorldInput) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints (F, 17, 2) px of a view at the first view's images, NaN = not seen, and confidences (F, 17)."""

@@ -7,26 +7,32 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraErrors, CameraPath
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.geometry.rotations import project_to_so3
 from drocap_ros.motion import LEVEL_CAMERA
-from drocap_ros.reconstruction.reconstruct import SolvedView
+from drocap_ros.reconstruction.person_view import true_shape
+from drocap_ros.reconstruction.reconstruct import Solved
 from drocap_ros.reconstruction.together.timing import ShownMotion
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.even_capture import keypoint_weights
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
-from drocap_ros.reconstruction.world.placement import place_in_world
-from drocap_ros.reconstruction.world.world_model import PlacedPoses, WorldConfig, WorldInput
+from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
+from drocap_ros.reconstruction.world.world_model import PlacedPoses, WorldConfig, WorldInput, config_of, world_config
 
 #: Longest time (s) between two images between which a joint is interpolated.
 _GAP_S = 0.1
 #: Way (m) within which a camera stands.
 _STANDS_M = 0.05
 #: Errors of a camera on a tripod: of its attitude none but that of its placement.
-_STANDING = WorldConfig(latency_std_s=1e-3, position_wander_m=0.002, attitude_wander_deg=0.01, checks=False)
+_STANDING = WorldConfig(
+    errors=CameraErrors(latency_s=1e-3, position_wander_m=0.002, attitude_wander_deg=0.01), checks=False
+)
 #: Errors of a path that two bodies give: their turns err by 4 degrees for a second, their ranges by a tenth.
-_FOLLOWED = WorldConfig(latency_std_s=1e-3, position_wander_m=0.5, attitude_wander_deg=8.0, checks=False)
+_FOLLOWED = WorldConfig(
+    errors=CameraErrors(latency_s=1e-3, position_wander_m=0.5, attitude_wander_deg=8.0), checks=False
+)
 
 
 class Doubt(NamedTuple):
@@ -45,50 +51,62 @@ class View:
     """A recording in its own world, z up.
 
     solved : of the recording alone
-    joints : (F, 17, 3) m; turn : (F, 3, 3) world -> camera; path : (F, 3) m
+    joints : (F, 17, 3) m; camera : there, its matrix known
     own_world : whether the recording has a world, by telemetry or by its picture; else that of its camera
-    reported : whether the world is that of telemetry: east, north and up
     config : errors of the camera there
     """
 
-    solved: SolvedView
+    solved: Solved
     joints: np.ndarray
-    turn: np.ndarray
-    path: np.ndarray
+    camera: CameraPath
     own_world: bool
-    reported: bool
     config: WorldConfig
 
     @staticmethod
-    def of(solved: SolvedView, name: str) -> View:
+    def of(solved: Solved, name: str) -> View:
         """The view of a recording that was solved alone."""
-        if solved.tracks.camera_matrix is None:
+        motion, camera = solved.motion, solved.camera
+        if camera.matrix is None:
             raise InputError(
                 f"{name}: expected a known lens, found none; add camera_matrix to the tracks, or the video"
             )
-        motion, joints = solved.motion, solved.motion.joints3d[:, :17]
         if motion.frame == "world" and motion.camera_position is not None:
-            rotation, position = motion.camera_rotation, motion.camera_position
-            config, given = solved.config, solved.tracks
-            reported = "camera" not in motion.meta
-            if config is not None and reported and given.camera_rotation is not None:
-                # The camera before the adjustment: its errors are to be found with all views.
-                assert given.camera_position is not None
-                rotation, position = given.camera_rotation, given.camera_position
+            if not camera.of_reports or camera.position is None:
+                # Of reports the camera before the adjustment: its errors are to be found with all views.
+                camera = camera.moved(motion.camera_rotation, motion.camera_position)
+            view = View(solved, motion.joints3d[:, :17], camera, True, _STANDING)
+            if camera.errors is not None:
+                config = config_of(camera, world_config(solved.settings.adjuster))
+                return replace(view, config=replace(config, checks=False))
             # A path whose up is unsure was not adjusted with the body: it errs as any that moves.
-            config = config or (_STANDING if np.ptp(position, axis=0).max() < _STANDS_M else WorldConfig())
-            config = replace(config, checks=False)
-            return View(solved, joints, rotation, position, True, reported, config)
+            return view if view.stands else replace(view, config=WorldConfig(checks=False))
         turn = np.broadcast_to(LEVEL_CAMERA, motion.camera_rotation.shape).copy()
-        path = np.zeros((len(joints), 3))
-        standing = replace(solved.tracks, camera_rotation=turn, camera_position=path)
-        placed = place_in_world(in_camera_axes(solved.poses, solved.per_px), _image(solved), solved.per_px, standing)
-        return View(solved, placed.joints, turn, path, False, False, _STANDING)
+        standing = camera.moved(turn, np.zeros((len(turn), 3)))
+        view = View(solved, motion.joints3d, standing, False, _STANDING)
+        poses = solved.poses
+        placed = place_in_world(in_camera_axes(poses, view.per_px), poses.in_image[..., :2], view.per_px, standing)
+        return replace(view, joints=placed.joints)
+
+    @property
+    def reported(self) -> bool:
+        """Whether the world is that of telemetry: east, north and up."""
+        return self.own_world and self.camera.of_reports
+
+    @property
+    def errors(self) -> np.ndarray | None:
+        """(F, 6, 6) covariance of a reported camera's position and rotation beyond ``config``; None = none."""
+        return self.solved.camera.covariance if self.solved.camera.of_reports else None
+
+    @property
+    def per_px(self) -> np.ndarray:
+        """(F,) metres per px at the assumed stature."""
+        shape = true_shape(self.solved.poses.in_image, self.camera.matrix)
+        return metres_per_px(shape, self.camera.stamp_ns, self.solved.settings.initializer.assumed_height_m)
 
     @property
     def time_s(self) -> np.ndarray:
         """(F,) s since the first image."""
-        stamps = self.solved.tracks.stamp_ns
+        stamps = self.camera.stamp_ns
         return np.asarray((stamps - stamps[0]) * 1e-9)
 
     def joints_at(self, time_s: np.ndarray) -> np.ndarray:
@@ -102,24 +120,17 @@ class View:
         return ShownMotion(self.joints, self.time_s, np.asarray((self.solved.keypoints.weights > 0).any(axis=1)))
 
     @property
-    def matrix(self) -> np.ndarray:
-        """(3, 3) px of the lens."""
-        assert self.solved.tracks.camera_matrix is not None
-        return self.solved.tracks.camera_matrix
-
-    @property
     def stands(self) -> bool:
         """Whether the camera stands."""
-        return bool(np.ptp(self.path, axis=0).max() < _STANDS_M)
+        return bool(np.ptp(self.camera.pose[1], axis=0).max() < _STANDS_M)
 
     def moved(self, scale: float, rotation: np.ndarray, translation: np.ndarray) -> View:
         """The view in another world: ``place there = scale * rotation @ place + translation``, by image or for all."""
-        back = np.swapaxes(rotation, -1, -2)
+        (turn, path), back = self.camera.pose, np.swapaxes(rotation, -1, -2)
         return replace(
             self,
             joints=scale * self.joints @ back + translation[..., None, :],
-            path=scale * (self.path[:, None] @ back)[:, 0] + translation,
-            turn=self.turn @ back,
+            camera=self.camera.moved(turn @ back, scale * (path[:, None] @ back)[:, 0] + translation),
             config=_FOLLOWED if rotation.ndim > 2 else self.config,
         )
 
@@ -128,21 +139,28 @@ class View:
         sigma, depth = self._depth()
         image = self.solved.poses.sigma_px
         assert image is not None
-        return PlacedPoses(joints, 1.0, depth, sigma, _image(self.solved), image[..., 0], self.solved.poses.still)
+        return PlacedPoses(
+            joints, 1.0, depth, sigma, self.solved.poses.in_image[..., :2], image[..., 0], self.solved.poses.still
+        )
 
     def at(self, time_s: np.ndarray, doubt: Doubt) -> WorldInput:
         """What the view shows at times (S,) s of its own clock; no weight where it shows nothing."""
-        solved, own = self.solved, self.time_s
+        (turn, path), matrix, solved, own = self.camera.pose, self.camera.matrix, self.solved, self.time_s
+        assert matrix is not None
         after = np.clip(np.searchsorted(own, time_s), 1, len(own) - 1)
         step = _Between(own, after - 1, after, time_s)
         assert solved.poses.sigma_px is not None
-        weight, image = keypoint_weights(solved.keypoints, solved.poses.sigma_px[..., 0]), _image(solved)
+        weight, image = (
+            keypoint_weights(solved.keypoints, solved.poses.sigma_px[..., 0]),
+            solved.poses.in_image[..., :2],
+        )
         # Keypoints have their own neighbours: a network may see a joint in every second image only.
         joint = _seen_beside(solved.keypoints.weights > 0, after, own, time_s)
         seen, guess = joint.inside, step.inside[:, None] & (solved.keypoints.weights[after - 1] == 0)
         xy = np.where(seen[..., None], joint.of(np.nan_to_num(solved.keypoints.xy)), step.of(image))
         guess &= ~seen & (solved.keypoints.weights[after] == 0)
         sigma, depth = self._depth()
+        wander_m = max(self.config.errors.position_wander_m, doubt.wander_m)
         still = solved.poses.still
         return WorldInput(
             keypoints=xy,
@@ -151,9 +169,9 @@ class View:
             # Where the view shows nothing its depths weigh nothing.
             depth_sigma=np.where(step.inside[:, None], step.of(sigma), 1e6),
             lengths=np.zeros(0),
-            telemetry=CameraTelemetry(project_to_so3(step.of(self.turn)), step.of(self.path), 1.0 / usual_step(time_s)),
-            camera_matrix=self.matrix,
-            config=replace(self.config, position_wander_m=max(self.config.position_wander_m, doubt.wander_m)),
+            telemetry=CameraTelemetry(project_to_so3(step.of(turn)), step.of(path), 1.0 / usual_step(time_s)),
+            camera_matrix=matrix,
+            config=replace(self.config, errors=replace(self.config.errors, position_wander_m=wander_m)),
             seen=seen,
             still=None if still is None else np.where(step.inside[:, None], step.of(still), 0.5),
             placed_m=doubt.placed_m,
@@ -162,14 +180,9 @@ class View:
 
     def _depth(self) -> tuple[np.ndarray, np.ndarray]:
         """(F, 17) m expected error of depths behind the pelvis, and these."""
-        poses, per_px = self.solved.poses, self.solved.per_px
+        poses, per_px = self.solved.poses, self.per_px
         assert poses.sigma_px is not None
         return poses.sigma_px[..., 1] * per_px[:, None], in_camera_axes(poses, per_px)[..., 2]
-
-
-def _image(solved: SolvedView) -> np.ndarray:
-    """(F, 17, 2) px of the poses."""
-    return np.asarray(solved.poses.joints_px[..., :2] + solved.poses.translation_px[:, None])
 
 
 class _Between:

@@ -13,8 +13,8 @@ from drocap_ros.geometry.rotations import exp_so3, log_so3
 _SMOOTHING_S = 0.25
 
 
-class CameraPath(NamedTuple):
-    """The camera at every frame.
+class ShiftedPath(NamedTuple):
+    """The camera at every frame, reported so much later.
 
     rotation : (F, 3, 3) world -> camera
     turn_rate : (F, 3) rad/s in camera axes
@@ -58,11 +58,11 @@ class CameraTelemetry:
         right /= np.linalg.norm(right)
         return np.stack([right, down, np.cross(right, down)])
 
-    def shifted(self, attitude_s: float, position_s: float) -> CameraPath:
+    def shifted(self, attitude_s: float, position_s: float) -> ShiftedPath:
         """The path with the attitude and the position of so many seconds later."""
         moved = self._smooth_at(position_s) - self._smooth
         rotation = exp_so3(self._turn_rate * attitude_s) @ self.rotation
-        return CameraPath(rotation, self._turn_rate, self.position + moved, self._velocity)
+        return ShiftedPath(rotation, self._turn_rate, self.position + moved, self._velocity)
 
     def roughness(self) -> float:
         """Standard deviation (m) of the position's change from frame to frame that no camera could fly."""

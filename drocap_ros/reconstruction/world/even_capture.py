@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.contacts import ankles_seen
 from drocap_ros.geometry.interpolation import MAX_GAP_S
 from drocap_ros.geometry.rotations import project_to_so3
@@ -14,7 +15,6 @@ from drocap_ros.reconstruction.common.windows import fade_weights, windows
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.window_solver import difference_noise
 from drocap_ros.reconstruction.world.world_model import PlacedPoses
-from drocap_ros.tracks import Tracks
 
 #: Least images of a part of a recording: with fewer no camera's motion shows.
 LEAST_FRAMES = 12
@@ -75,11 +75,10 @@ class CaptureWindow(NamedTuple):
     tells: bool
 
 
-def even_capture(tracks: Tracks, keypoints: Keypoints2D, poses: PlacedPoses, origin: np.ndarray) -> EvenCapture:
+def even_capture(camera: CameraPath, keypoints: Keypoints2D, poses: PlacedPoses, origin: np.ndarray) -> EvenCapture:
     """The recording about an origin (3,) m, on the even grid."""
-    assert tracks.camera_rotation is not None
-    assert tracks.camera_position is not None
-    slot, fps = even_slots(tracks.stamp_ns)
+    rotation, position = camera.pose
+    slot, fps = even_slots(camera.stamp_ns)
     weight = np.zeros((int(slot[-1]) + 1, keypoints.xy.shape[1]))
     points = np.zeros((*weight.shape, 2))
     seen = np.zeros(weight.shape, bool)
@@ -98,10 +97,10 @@ def even_capture(tracks: Tracks, keypoints: Keypoints2D, poses: PlacedPoses, ori
         factor=poses.factor,
         depth=at_all_slots(poses.depth, slot),
         depth_sigma=at_all_slots(poses.depth_sigma, slot),
-        turn=project_to_so3(at_all_slots(tracks.camera_rotation, slot)),
-        path=at_all_slots(tracks.camera_position - origin, slot),
+        turn=project_to_so3(at_all_slots(rotation, slot)),
+        path=at_all_slots(position - origin, slot),
         still=None if poses.still is None else at_all_slots(poses.still, slot),
-        parts=capture_parts(tracks.stamp_ns, slot),
+        parts=capture_parts(camera.stamp_ns, slot),
     )
 
 

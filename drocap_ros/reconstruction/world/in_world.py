@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
@@ -17,7 +18,6 @@ from drocap_ros.reconstruction.world.refine import Before, RefinedWorld, refinab
 from drocap_ros.reconstruction.world.telemetry_checks import upside_down
 from drocap_ros.reconstruction.world.world_model import PlacedPoses, WorldConfig
 from drocap_ros.skeleton import BODY_15
-from drocap_ros.tracks import Tracks
 
 _PELVIS = BODY_15.index("pelvis")
 
@@ -37,7 +37,7 @@ def in_camera_axes(poses: ImagePoses, per_px: np.ndarray) -> np.ndarray:
 
 
 def in_world(
-    tracks: Tracks,
+    camera: CameraPath,
     keypoints: Keypoints2D,
     poses: ImagePoses,
     per_px: np.ndarray,
@@ -45,7 +45,7 @@ def in_world(
     known: Findings | None = None,
     before: Before | None = None,
 ) -> WorldResult:
-    """Poses placed by ``tracks.camera_rotation`` and, with the camera's position and matrix, adjusted with it.
+    """Poses placed by the camera's rotation and, with its position and matrix, adjusted with it.
 
     Parameters
     ----------
@@ -54,13 +54,13 @@ def in_world(
     config : of the adjustment; None = the poses are placed alone
     known, before : findings of earlier windows, and the last of them
     """
-    rotation = tracks.camera_rotation
+    rotation = camera.rotation
     assert rotation is not None
-    projected, sigma = poses.joints_px[..., :2] + poses.translation_px[:, None], poses.sigma_px
-    whole = sigma is not None and config is not None and refinable(tracks)
-    if tracks.camera_position is not None and whole:
-        tracks = replace(tracks, camera_position=without_steps(tracks.camera_position, tracks.stamp_ns))
-    placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
+    projected, sigma = poses.in_image[..., :2], poses.sigma_px
+    whole = sigma is not None and config is not None and refinable(camera)
+    if camera.position is not None and whole:
+        camera = replace(camera, position=without_steps(camera.position, camera.stamp_ns))
+    placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, camera)
     refusal = upside_down(placed.joints, rotation) if sigma is not None and config and config.checks else None
     if refusal or sigma is None or config is None or not whole or not np.isfinite(placed.joints).all():
         return WorldResult(placed, refusal=refusal)
@@ -69,5 +69,5 @@ def in_world(
     given = PlacedPoses(
         placed.joints, placed.factor, depth, sigma[..., 1] * size, projected, sigma[..., 0], poses.still
     )
-    found = refine_in_world(tracks, keypoints, given, config, known, before)
+    found = refine_in_world(camera, keypoints, given, config, known, before)
     return WorldResult(placed, refusal=found) if isinstance(found, Refusal) else WorldResult(placed, found)

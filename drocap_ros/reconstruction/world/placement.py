@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.reconstruction.world.metric_scale import ScaleEstimate, estimate_scale
 from drocap_ros.skeleton import BODY_15
-from drocap_ros.tracks import Tracks
 
 #: Standard deviation (s) of the average of the person's image size: a drone changes its range slowly.
 _SIZE_SMOOTHING_S = 1.0
@@ -49,7 +49,7 @@ class WorldPoses:
         return self.scale.factor if self.metric and self.scale is not None else 1.0
 
 
-def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndarray, tracks: Tracks) -> WorldPoses:
+def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndarray, camera: CameraPath) -> WorldPoses:
     """Poses (F, 15, 3) m in camera axes, pelvis at the origin, rotated and translated to the world (ENU, z up).
 
     The pelvis lies at the weak-perspective range, focal length times metres per px; every joint lies on the ray of
@@ -57,9 +57,9 @@ def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndar
     Without the camera's position the pelvis stays at the origin, without its matrix the perspective is unknown, too.
     Sufficient camera motion measures the scale.
     """
-    to_world = tracks.camera_rotation
+    to_world = camera.rotation
     assert to_world is not None
-    k = tracks.camera_matrix
+    k = camera.matrix
     if k is None:
         return WorldPoses(joints @ to_world, False, "assumed_height", None)
     range_m = 0.5 * (k[0, 0] + k[1, 1]) * per_px
@@ -69,11 +69,11 @@ def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndar
     # A joint nearer than a tenth of the range is an error of the pose.
     depth = np.maximum(range_m[:, None] + joints[..., 2], 0.1 * range_m[:, None])
     from_camera = (ray * depth[..., None]) @ to_world
-    if tracks.camera_position is None:
+    if camera.position is None:
         return WorldPoses(from_camera - from_camera[:, :1], False, "assumed_height", None)
     feet = from_camera[:, [BODY_15.index("lankle"), BODY_15.index("rankle")]]
-    scale = estimate_scale(feet, tracks.camera_position, tracks.stamp_ns)
+    scale = estimate_scale(feet, camera.position, camera.stamp_ns)
     trusted = scale is not None and scale.trusted
     factor = scale.factor if scale is not None and trusted else 1.0
-    placed = tracks.camera_position[:, None] + factor * from_camera
+    placed = camera.position[:, None] + factor * from_camera
     return WorldPoses(placed, trusted, "telemetry" if trusted else "assumed_height", scale)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.contacts import ANKLES
 from drocap_ros.geometry.ellipsoids import pack_covariance
 from drocap_ros.geometry.rotations import exp_so3
@@ -48,8 +49,6 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldInput,
     WorldState,
 )
-from drocap_ros.reconstruction.world.world_residuals import WANDER_S
-from drocap_ros.tracks import Tracks
 
 #: Frames whose solution a live window takes over from the one before: two hold place and speed.
 _HELD = 2
@@ -99,16 +98,13 @@ class Before(NamedTuple):
     shared: np.ndarray
 
 
-def refinable(tracks: Tracks) -> bool:
-    """Whether there are a camera's finite matrix, rotations and positions, and twelve frames."""
-    rotation, position = tracks.camera_rotation, tracks.camera_position
-    if rotation is None or position is None or tracks.camera_matrix is None or len(tracks) < LEAST_FRAMES:
-        return False
-    return bool(np.isfinite(rotation).all() and np.isfinite(position).all())
+def refinable(camera: CameraPath) -> bool:
+    """Whether the camera's matrix is known, its rotations and positions in all images, and there are twelve of them."""
+    return camera.matrix is not None and len(camera.stamp_ns) >= LEAST_FRAMES and bool(camera.known.all())
 
 
 def refine_in_world(
-    tracks: Tracks,
+    camera: CameraPath,
     keypoints: Keypoints2D,
     poses: PlacedPoses,
     config: WorldConfig | None = None,
@@ -116,24 +112,23 @@ def refine_in_world(
     before: Before | None = None,
     beside: Beside | None = None,
 ) -> RefinedWorld | Refusal:
-    """Adjust poses and camera of :func:`refinable` tracks; a refusal where the telemetry cannot be true.
+    """Adjust poses and a :func:`refinable` camera; a refusal where the telemetry cannot be true.
 
     ``known`` : findings of earlier windows; ``before`` : the last of them, which a live window continues.
     ``beside`` : other cameras' views of the same body.
     """
     beside = beside or Beside()
     config = config or WorldConfig()
-    rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
-    assert rotation is not None
-    assert position is not None
+    (rotation, position), matrix, stamp_ns = camera.pose, camera.matrix, camera.stamp_ns
     assert matrix is not None
     # The scale turns about the origin: near the camera's path, or the held person.
-    origin = position.mean(axis=0) if before is None else _held_pelvis(before, int(tracks.stamp_ns[0]))
-    capture = even_capture(tracks, keypoints, poses, origin)
+    origin = position.mean(axis=0) if before is None else _held_pelvis(before, int(stamp_ns[0]))
+    capture = even_capture(camera, keypoints, poses, origin)
     windows = capture_windows(capture, config.feet)
     if config.checks and (refusal := _impossible(capture, windows)):
         return refusal
-    start, held = _start(tracks.stamp_ns, (poses.joints - origin) / poses.factor, origin, 1.0 / poses.factor, before)
+    body = (poses.joints - origin) / poses.factor
+    start, held = _start(stamp_ns, body, origin, 1.0 / poses.factor, before, config.errors.wander_s)
     facts, faded = _Facts(), _Faded(len(capture.body), len(beside.views))
     for window, data, found in _adjusted(capture, windows, _Scene(matrix, config, start, held, known, beside)):
         telemetry = data.telemetry
@@ -144,17 +139,17 @@ def refine_in_world(
         return refusal
     joints, cameras, wander, place, covariance = (values[capture.slot] for values in faded.mean())
     joints += origin
-    camera, *further = np.moveaxis(cameras, 1, 0)
+    own, *further = np.moveaxis(cameras, 1, 0)
     return RefinedWorld(
         joints=joints,
-        rotation=exp_so3(camera[:, 3:]) @ rotation,
-        position=position + camera[:, :3],
+        rotation=exp_so3(own[:, 3:]) @ rotation,
+        position=position + own[:, :3],
         metric=facts.metric,
         place=pack_covariance(place),
         covariance=pack_covariance(covariance),
         calibration=facts.calibration,
         found=last.findings,
-        before=Before(tracks.stamp_ns, joints, wander, last.state.globals[:GLOBALS]),
+        before=Before(stamp_ns, joints, wander, last.state.globals[:GLOBALS]),
         further=np.array(further).reshape(-1, len(joints), CAMERA),
     )
 
@@ -276,7 +271,12 @@ def _held_pelvis(before: Before, stamp_ns: int) -> np.ndarray:
 
 
 def _start(
-    stamp_ns: np.ndarray, body: np.ndarray, origin: np.ndarray, scale: float, before: Before | None
+    stamp_ns: np.ndarray,
+    body: np.ndarray,
+    origin: np.ndarray,
+    scale: float,
+    before: Before | None,
+    wander_s: np.ndarray,
 ) -> tuple[Before, int]:
     """The point to start from, joints in m of the body about ``origin``, and the number of held frames.
 
@@ -294,7 +294,7 @@ def _start(
     joints[last + 1 :] += joints[last, 0] - body[last, 0]
     passed_s = float(stamp_ns[-1] - before.stamp_ns[-1]) * 1e-9
     # The errors' steps from frame to frame have no pull to zero: without this they would drift on an endless stream.
-    wander[common] = before.wander[theirs] * np.exp(-passed_s / WANDER_S)
+    wander[common] = before.wander[theirs] * np.exp(-passed_s / wander_s)
     wander[last + 1 :] = wander[last]
     return Before(stamp_ns, joints, wander, shared), _HELD
 

@@ -6,13 +6,14 @@ scale enters through the camera's position alone, and no term that prefers littl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from drocap_ros.camera_path import CameraErrors, CameraPath
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
-from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, ShiftedPath
 from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.skeleton import BODY_15, BODY_17
 
@@ -44,12 +45,9 @@ class WorldConfig:
     iterations, locking_iterations : steps, and further ones that keep feet in contact in their places
     stature_std, length_std : relative standard deviations of the assumed stature and of the lifter's bone lengths:
         noise lengthens free bones
-    tilt_error_deg, yaw_error_deg : standard deviations of the camera's constant errors: gimbals know the horizon, not
-        north
-    latency_std_s : of attitude and position
-    position_wander_m, attitude_wander_deg : standard deviations of the slow errors; rough positions have more
-    corrected : the telemetry is a path that fixed points have corrected
-    camera_acceleration_m_s2, acceleration_m_s2 : ordinary ones of the camera and of a joint
+    errors : of the camera; rough positions wander farther
+    corrected : the camera's path is one that fixed points have corrected
+    acceleration_m_s2 : ordinary one of a joint
     depth_weight : of the lifter's depths
     contact_weight, locked_weight : of feet in contact, less than 1 as contacts last for some frames, and of locked ones
     contact_speed_m_s : standard deviation of the speed of a foot in contact
@@ -62,13 +60,8 @@ class WorldConfig:
     locking_iterations: int = 2
     stature_std: float = 0.05
     length_std: float = 0.002
-    tilt_error_deg: float = 0.3
-    yaw_error_deg: float = 2.0
-    latency_std_s: float = 0.1
-    position_wander_m: float = 0.05
-    attitude_wander_deg: float = 0.1
+    errors: CameraErrors = field(default_factory=CameraErrors)
     corrected: bool = False
-    camera_acceleration_m_s2: float = 3.0
     acceleration_m_s2: float = 16.0
     depth_weight: float = 0.2
     contact_weight: float = 0.2
@@ -81,14 +74,18 @@ class WorldConfig:
 
 def world_config(adjuster: BundleAdjusterConfig) -> WorldConfig:
     """The parameters that the bundle adjuster's section sets; the weights keep their defaults."""
-    return WorldConfig(
-        stature_std=adjuster.stature_std,
-        tilt_error_deg=adjuster.telemetry_tilt_deg,
-        yaw_error_deg=adjuster.telemetry_yaw_deg,
-        latency_std_s=adjuster.telemetry_latency_s,
-        position_wander_m=adjuster.telemetry_position_m,
-        attitude_wander_deg=adjuster.telemetry_attitude_deg,
-        feet=adjuster.feet,
+    return WorldConfig(stature_std=adjuster.stature_std, errors=adjuster.telemetry_errors, feet=adjuster.feet)
+
+
+def config_of(camera: CameraPath, config: WorldConfig) -> WorldConfig:
+    """The parameters of an adjustment with this camera, which has ``errors``."""
+    assert camera.errors is not None
+    return replace(
+        config,
+        stature_std=config.stature_std if camera.scale_std is None else camera.scale_std,
+        errors=camera.errors,
+        corrected=camera.corrected,
+        checks=config.checks and camera.of_reports,
     )
 
 
@@ -162,7 +159,7 @@ class WorldState:
     camera: np.ndarray
     globals: np.ndarray
 
-    def path(self, telemetry: CameraTelemetry) -> CameraPath:
+    def path(self, telemetry: CameraTelemetry) -> ShiftedPath:
         """The telemetry shifted by the latencies, without the other errors."""
         return telemetry.shifted(float(self.globals[ATTITUDE_LATENCY]), float(self.globals[POSITION_LATENCY]))
 

@@ -53,8 +53,6 @@ GAUGE_M = 0.0005
 #: The shared unknowns of the camera, and their columns in its derivatives: a misalignment turns every frame.
 OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY]
 CAMERA_COLUMNS = np.array([6, 3, 4, 5, 7, 8])
-#: (6,) time constants of the slow errors of position and attitude.
-WANDER_S = np.repeat([60.0, 10.0], 3)
 #: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
 _OWN_LATENCY = 0.2
 
@@ -80,23 +78,23 @@ class WorldWeights(NamedTuple):
 
 def weights_of(data: WorldInput) -> WorldWeights:
     """Weights from the parameters and from the telemetry's roughness."""
-    config, fps = data.config, data.fps
-    rough = data.telemetry.roughness() / np.sqrt(2.0 / (WANDER_S[0] * fps))
+    config, errors, fps = data.config, data.config.errors, data.fps
+    rough = data.telemetry.roughness() / np.sqrt(2.0 / (errors.position_wander_s * fps))
     # What points leave of a receiver's noise is no error that wanders.
-    position = config.position_wander_m if config.corrected else max(config.position_wander_m, rough)
-    attitude = np.deg2rad(config.attitude_wander_deg)
+    position = errors.position_wander_m if config.corrected else max(errors.position_wander_m, rough)
+    attitude = np.deg2rad(errors.attitude_wander_deg)
     first = np.repeat([position**-2, attitude**-2], 3)
-    wander = first * (0.5 * WANDER_S * fps)
+    wander = first * (0.5 * errors.wander_s * fps)
     shared = np.zeros((GLOBALS, GLOBALS))
     shared[LENGTHS, LENGTHS] = np.diag((config.length_std * data.lengths) ** -2)
     shared[FLOOR, FLOOR] = _ANY_FLOOR_M**-2
     shared[SCALE, SCALE] = config.stature_std**-2
     axes = data.telemetry.gimbal_axes()
-    turned = np.deg2rad([config.tilt_error_deg, config.yaw_error_deg, config.tilt_error_deg])
+    turned = np.deg2rad([errors.tilt_deg, errors.yaw_deg, errors.tilt_deg])
     shared[MISALIGNMENT, MISALIGNMENT] = axes.T @ np.diag(turned**-2) @ axes
     own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
     latencies = slice(ATTITUDE_LATENCY, POSITION_LATENCY + 1)
-    shared[latencies, latencies] = np.linalg.inv(config.latency_std_s**2 * own)
+    shared[latencies, latencies] = np.linalg.inv(errors.latency_s**2 * own)
     expected = np.zeros(GLOBALS)
     if data.known is not None:
         shared[CALIBRATED, CALIBRATED] += data.known.precision
@@ -104,7 +102,7 @@ def weights_of(data: WorldInput) -> WorldWeights:
     fact = config.frames_per_fact
     return WorldWeights(
         acceleration=(config.acceleration_m_s2 / fps**2) ** -2,
-        camera_acceleration=(config.camera_acceleration_m_s2 / fps**2) ** -2,
+        camera_acceleration=(errors.acceleration_m_s2 / fps**2) ** -2,
         depth=config.depth_weight / np.maximum(data.depth_sigma, 0.01),
         wander=fact * wander,
         first=fact * first,

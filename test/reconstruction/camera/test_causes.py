@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fixed_points import MATRIX, SIZE, Scene, orbit, points_of, seen
+from fixed_points import MATRIX, Scene, orbit, points_of, seen
 
 from drocap_ros.background import Background
+from drocap_ros.camera_path import CameraErrors, CameraPath
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, with_causes
+from drocap_ros.reconstruction.camera.fusion import Fusion, fuse_telemetry, with_causes
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
-from drocap_ros.reconstruction.world.world_model import WorldConfig
-from drocap_ros.skeleton import BODY_15
-from drocap_ros.tracks import Tracks
 
 FPS = 12.0
 FRAMES = 90
@@ -35,23 +33,18 @@ def found(flight: Scene, turned_deg: tuple[float, float, float], late: tuple[int
     time = np.arange(FRAMES)[:, None] / FPS
     wander = wander_m * np.sin(time * [0.11, 0.15, 0.08] + [0.0, 1.0, 2.0])
     attitude, position = (slice(part.start - frames, part.stop - frames) for frames in late)
-    tracks = Tracks(
-        keypoints=np.full((FRAMES, 15, 2), 300.0),
-        joints=BODY_15.joints,
-        stamp_ns=np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64),
-        image_size=SIZE,
-        camera_rotation=rotation[attitude],
-        camera_position=flight.position[position] + wander,
-        camera_matrix=MATRIX,
-        background=Background(
-            (flight.frame[inside] - part.start).astype(np.int32),
-            flight.track[inside].astype(np.int64),
-            (flight.point[inside] + noise).astype(np.float32),
-        ),
+    stamp_ns = np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
+    camera = CameraPath(stamp_ns, rotation[attitude], flight.position[position] + wander, MATRIX)
+    background = Background(
+        (flight.frame[inside] - part.start).astype(np.int32),
+        flight.track[inside].astype(np.int64),
+        (flight.point[inside] + noise).astype(np.float32),
     )
-    fused = fuse_telemetry(tracks, WorldConfig())
-    assert isinstance(fused, FusedTelemetry)
-    return with_causes(fused, WorldConfig()).measured
+    fused = fuse_telemetry(camera, background)
+    assert isinstance(fused, Fusion)
+    measured = with_causes(fused, CameraErrors()).measured
+    assert measured is not None
+    return measured
 
 
 @pytest.mark.parametrize(

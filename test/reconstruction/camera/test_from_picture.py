@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from fixed_points import MATRIX, SIZE, Scene, looking, orbit, points_of, seen, shape_error, turn_errors_deg
 
+from drocap_ros.camera_path import Kind, PictureFacts
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
-from drocap_ros.reconstruction.camera.kinds import Kind
+from drocap_ros.reconstruction.camera.from_picture import camera_from_points
 from drocap_ros.reconstruction.common.threads import blas_threads
 
 FPS = 12.0
@@ -20,10 +22,23 @@ def orbiting(flat: bool = False, points: int = 400) -> Scene:
     return seen(*orbit(FRAMES, FPS), points_of(rng, points, flat), FPS)
 
 
-def camera_of(scene: Scene, matrix: np.ndarray | None = MATRIX, noise_px: float = 0.0) -> PictureCamera:
+class Found(NamedTuple):
+    """A camera, all of it known."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    matrix: np.ndarray
+    kind: Kind
+    facts: PictureFacts
+
+
+def camera_of(scene: Scene, matrix: np.ndarray | None = MATRIX, noise_px: float = 0.0) -> Found:
     point = scene.point + noise_px * np.random.default_rng(1).standard_normal(scene.point.shape)
     with blas_threads(1):
-        return camera_from_points(scene.frame, scene.track, point, FPS, len(scene.rotation), SIZE, matrix)
+        camera = camera_from_points(scene.frame, scene.track, point, FPS, len(scene.rotation), SIZE, matrix)
+    assert camera.picture is not None
+    assert camera.matrix is not None
+    return Found(*camera.pose, camera.matrix, camera.picture.kind, camera.picture)
 
 
 @pytest.mark.parametrize("flat", [False, True])
@@ -31,7 +46,7 @@ def test_path_without_noise_is_found_exactly(flat: bool) -> None:
     scene = orbiting(flat)
     found = camera_of(scene)
     assert found.kind is Kind.MOVES
-    assert found.covered == 1.0
+    assert found.facts.covered == 1.0
     assert turn_errors_deg(found.rotation, scene.rotation, FPS).max() < 0.05
     assert shape_error(found.position, scene.position) < 0.02
 
@@ -41,7 +56,7 @@ def test_path_and_lens_are_found_together() -> None:
     found = camera_of(scene, None, 0.4)
     assert found.kind is Kind.MOVES
     assert found.matrix[0, 0] == pytest.approx(MATRIX[0, 0], rel=0.02)
-    assert abs(np.log(found.matrix[0, 0] / MATRIX[0, 0])) < 4.0 * found.focal_std
+    assert abs(np.log(found.matrix[0, 0] / MATRIX[0, 0])) < 4.0 * found.facts.focal_std
     assert shape_error(found.position, scene.position) < 0.1
 
 
@@ -86,7 +101,7 @@ def test_path_goes_on_over_the_ground_where_a_camera_hovers(seed: int) -> None:
     scene = climbing_and_hovering(points_of(np.random.default_rng(seed), 400, flat=True), 0.05)
     found = camera_of(scene, noise_px=0.3)
     assert found.kind is Kind.MOVES
-    assert found.covered > 0.95
+    assert found.facts.covered > 0.95
     assert shape_error(found.position, scene.position) < 0.05
 
 
@@ -108,9 +123,9 @@ def test_deviations_of_a_path_are_as_its_errors_and_tell_a_weak_place() -> None:
     thin = thin._replace(track=thin.track + 1_000_000 * ((thin.track // 1000 % 4 > 0) & (thin.frame >= weak[1])))
     claimed_m = []
     for camera in [camera_of(each, noise_px=0.4) for each in (scene, thin)]:
-        assert camera.drift is not None
+        assert camera.facts.drift is not None
         way = np.linalg.norm(np.ptp(scene.position, axis=0)) / np.linalg.norm(np.ptp(camera.position, axis=0))
-        claimed_m.append(way * np.sqrt(3.0 * np.square(camera.drift[:, 0]).mean()))
+        claimed_m.append(way * np.sqrt(3.0 * np.square(camera.facts.drift[:, 0]).mean()))
         assert 0.2 < shape_error(camera.position, scene.position) / claimed_m[-1] < 1.5
     assert claimed_m[1] > 1.2 * claimed_m[0]
 

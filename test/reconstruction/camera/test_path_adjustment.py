@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from fixed_points import MATRIX, Scene, looking, orbit, points_of, seen, shape_error, turn_errors_deg
 
+from drocap_ros.camera_path import CameraErrors
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.path_adjustment import adjust_path, initial_state
 from drocap_ros.reconstruction.camera.path_equations import PathEquations
@@ -26,7 +27,7 @@ from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 
 FPS = 12.0
-CONFIG = PathConfig(focal=0.1, yaw_deg=2.0, tilt_deg=1.0)
+CONFIG = PathConfig(CameraErrors(yaw_deg=2.0, tilt_deg=1.0), focal=0.1)
 
 
 def scene(frames: int = 60, points: int = 300) -> Scene:
@@ -115,7 +116,12 @@ def test_noise_free_views_recover_misalignment_wander_and_focal_length_exactly()
     true = scene(96)
     # Weights of the priors vanish beside views without noise.
     config = replace(
-        CONFIG, noise_px=1e-3, focal=0.1, latency_s=0.0, iterations=40, position_wander_m=0.3, jitter_m=0.01
+        CONFIG,
+        errors=replace(CONFIG.errors, latency_s=0.0, position_wander_m=0.3),
+        noise_px=1e-3,
+        focal=0.1,
+        iterations=40,
+        jitter_m=0.01,
     )
     data = given(true, 1.0, 0.1, config)
     longer = np.diag([1.03, 1.03, 1.0])
@@ -185,12 +191,15 @@ def test_points_that_slide_lose_their_weight() -> None:
 
 def test_origin_north_and_unit_of_the_scene_do_not_matter() -> None:
     true = scene(48)
-    data = given(true, 1.0, 0.1, replace(CONFIG, latency_s=0.0))
+    data = given(true, 1.0, 0.1, replace(CONFIG, errors=replace(CONFIG.errors, latency_s=0.0)))
     found = adjust_path(data)
     turn, unit = exp_so3(np.array([0.0, 0.0, 2.0])), 3.0
     path = CameraTelemetry(data.path.rotation @ turn.T, unit * (data.path.position @ turn.T + [40.0, -30.0, 5.0]), FPS)
-    lengths = {n: unit * getattr(CONFIG, n) for n in ("position_wander_m", "acceleration_m_s2", "jitter_m")}
-    other = adjust_path(PathInput(path, MATRIX, data.views, replace(data.config, **lengths)))
+    errors = data.config.errors
+    wander_m, acceleration = unit * errors.position_wander_m, unit * errors.acceleration_m_s2
+    errors = replace(errors, position_wander_m=wander_m, acceleration_m_s2=acceleration)
+    config = replace(data.config, errors=errors, jitter_m=unit * CONFIG.jitter_m)
+    other = adjust_path(PathInput(path, MATRIX, data.views, config))
     assert found is not None
     assert other is not None
     np.testing.assert_allclose(other.rotation @ turn, found.rotation, atol=2e-5)

@@ -11,10 +11,11 @@ from fixed_points import MATRIX, SIZE, looking, orbit, points_of, seen, shape_er
 from walking import make_walk
 
 from drocap_ros.background import Background
+from drocap_ros.camera_path import CameraPath, Kind, PictureFacts, UpSource
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import Motion
-from drocap_ros.reconstruction.camera.upright import UpSource, set_upright
-from drocap_ros.reconstruction.reconstruct import reconstruct, reconstruct_with_camera
+from drocap_ros.reconstruction.camera.upright import set_upright
+from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
@@ -95,12 +96,22 @@ def test_camera_that_stands_still_gives_a_world_at_its_place() -> None:
 
 def test_cut_within_one_camera_leaves_the_motion_in_camera_axes_and_is_named() -> None:
     given = tracks(*orbit(FRAMES, FPS), cut=True)
-    motion, _ = reconstruct_with_camera(given, method="ba")
+    motion = reconstruct(given)
     assert motion.frame == "camera"
     assert motion.meta["camera"]["kind"] == "cut"
     assert "cut" in telemetry_words(motion.meta)
     without = reconstruct(replace(given, background=None))
     np.testing.assert_array_equal(motion.joints3d, without.joints3d)
+
+
+def upright(
+    rotation: np.ndarray, position: np.ndarray, points: np.ndarray, joints: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, PictureFacts]:
+    stamps = np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
+    given = CameraPath(stamps, rotation, position, picture=PictureFacts(Kind.MOVES, points=points))
+    found = set_upright(given, joints)
+    assert found.picture is not None
+    return *found.pose, found.picture
 
 
 @pytest.mark.parametrize("unit", [0.05, 30.0])
@@ -110,29 +121,26 @@ def test_unit_and_axes_of_a_path_do_not_matter_for_up_and_metres(unit: float) ->
     turn, points = exp_so3(np.array([1.0, -0.5, 2.0])), points_of(rng, 300)
     seen_joints = (person() - position[:, None]) @ np.swapaxes(rotation, 1, 2)
     lying = np.column_stack([unit * points @ turn.T, np.ones(len(points))])
-    stamps = np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
-    found = set_upright(rotation @ turn.T, unit * position @ turn.T, lying, seen_joints, stamps)
-    assert found.source is UpSource.GROUND
-    assert np.degrees(np.arccos((found.rotation[:, :, 2] * rotation[:, :, 2]).sum(-1))).max() < 1.0
-    assert np.median(found.position[:, 2] / position[:, 2]) == pytest.approx(1.0, abs=0.1)
-    assert np.ptp(found.position[:, 0]) > 0.0
+    turned, moved, facts = upright(rotation @ turn.T, unit * position @ turn.T, lying, seen_joints)
+    assert facts.up is UpSource.GROUND
+    assert np.degrees(np.arccos((turned[:, :, 2] * rotation[:, :, 2]).sum(-1))).max() < 1.0
+    assert np.median(moved[:, 2] / position[:, 2]) == pytest.approx(1.0, abs=0.1)
+    assert np.ptp(moved[:, 0]) > 0.0
 
 
 def test_level_view_has_an_up() -> None:
     position = np.stack([np.linspace(-2.0, 2.0, FRAMES), np.full(FRAMES, -6.0), np.full(FRAMES, 1.0)], axis=1)
     rotation = looking(position, position + np.array([0.0, 1.0, 0.0]))
     joints = (person() - position[:, None]) @ np.swapaxes(rotation, 1, 2)
-    stamps = np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
-    found = set_upright(rotation, position, np.zeros((0, 4)), joints, stamps)
-    assert found.source is not UpSource.GROUND
-    assert found.rotation[0, 1, 2] == pytest.approx(-1.0, abs=0.03)
+    turned, _, facts = upright(rotation, position, np.zeros((0, 4)), joints)
+    assert facts.up is not UpSource.GROUND
+    assert turned[0, 1, 2] == pytest.approx(-1.0, abs=0.03)
 
 
 def test_scale_is_a_guess_where_neither_ground_nor_feet_tell_it() -> None:
     rotation, position = orbit(FRAMES, FPS)
     joints = (person() - position[:, None]) @ np.swapaxes(rotation, 1, 2)
     far = np.column_stack([np.random.default_rng(2).normal(0.0, 0.3, (15, 3)), np.ones(15)])
-    stamps = np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
-    found = set_upright(rotation, 0.1 * position, far, joints, stamps)
-    assert found.scale_std > 0.5
-    assert not found.feet_tell
+    _, _, facts = upright(rotation, 0.1 * position, far, joints)
+    assert facts.scale_std > 0.5
+    assert not facts.feet_tell

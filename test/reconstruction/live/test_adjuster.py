@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from walking import make_walk, stamps
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
@@ -47,7 +47,7 @@ def seen_by(turn: np.ndarray, camera: bool = True) -> AdjustedWindow:
     w = window()._replace(keypoints=Keypoints2D(image, np.ones(image.shape[:2])).with_joints(17))
     unknown = np.full((FRAMES, 3, 3), np.nan)
     return LiveAdjuster(BundleAdjusterConfig()).adjust(
-        w._replace(camera=WindowCamera(unknown, unknown[:, 0], matrix) if camera else None)
+        w._replace(camera=CameraPath(w.stamp_ns, unknown, unknown[:, 0], matrix) if camera else None)
     )
 
 

@@ -13,12 +13,12 @@ import pytest
 from telemetry_stream import FPS, Orbit, orbit
 
 from drocap_ros.background import Background
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.rotations import exp_so3, log_so3, quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
-from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry
+from drocap_ros.reconstruction.camera.fusion import Fusion, fuse_telemetry
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
@@ -36,7 +36,7 @@ ADJUSTER = BundleAdjusterConfig()
 SELDOM = BundleAdjusterConfig(period_s=2.0)
 #: Poses of streams that were lifted before, by all their images so far, which it keeps alive.
 LIFTED: dict[int, tuple[InitialPose | None, StreamEvent, PoseObservation]] = {}
-CameraAt = Callable[[np.ndarray, tuple[int, int]], WindowCamera | None]
+CameraAt = Callable[[np.ndarray, tuple[int, int]], CameraPath | None]
 
 
 class Remembering:
@@ -263,9 +263,9 @@ def test_reports_of_another_flight_are_refused_by_the_points_and_seldom_asked_ag
 ) -> None:
     true, asked = flown(), list[int]()
 
-    def counted(tracks: Tracks, *rest: Any) -> FusedTelemetry | Refusal | None:
-        asked.append(int(tracks.stamp_ns[-1]))
-        return fuse_telemetry(tracks, *rest)
+    def counted(camera: CameraPath, *rest: Any) -> Fusion | Refusal | None:
+        asked.append(int(camera.stamp_ns[-1]))
+        return fuse_telemetry(camera, *rest)
 
     monkeypatch.setattr("drocap_ros.reconstruction.live.fused_camera.fuse_telemetry", counted)
     other = replace(true, rotation=true.rotation[::-1], position=true.position[::-1])

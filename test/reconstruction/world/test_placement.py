@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from walking import stamps
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.world.metric_scale import estimate_scale
@@ -99,9 +100,7 @@ def test_placement_is_the_back_projection() -> None:
     k = truth.tracks.camera_matrix
     assert k is not None
     per_px = camera[:, 0, 2] / k[0, 0]
-    exact = dataclasses.replace(
-        truth.tracks, camera_rotation=truth.camera_rotation, camera_position=truth.camera_position
-    )
+    exact = CameraPath(truth.tracks.stamp_ns, truth.camera_rotation, truth.camera_position, k)
     placed = place_in_world(camera - camera[:, :1], truth.keypoints_exact, per_px, exact)
     assert placed.metric
     np.testing.assert_allclose(placed.joints, x, atol=0.15)

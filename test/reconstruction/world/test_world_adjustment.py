@@ -10,6 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from drocap_ros.camera_path import CameraErrors
 from drocap_ros.contacts import ANKLES, RestingFeet
 from drocap_ros.evaluation.metrics import ellipsoid_coverage, scale_error, still_foot_speed
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian, log_so3
@@ -109,7 +110,7 @@ def test_normal_matrix_holds_body_and_camera_together_by_the_first_frame_of_the_
     joints = walker(frames)
     rotation, position = orbit(bearing_with_reversal(frames), followed(joints))
     data = exact_input(joints, rotation, position, CameraTelemetry(rotation, position, FPS))
-    data = replace(data, config=WorldConfig(position_wander_m=0.5))
+    data = replace(data, config=WorldConfig(errors=CameraErrors(position_wander_m=0.5)))
     shared = np.zeros(GLOBALS)
     shared[LENGTHS], shared[SCALE] = data.lengths, 1.0
     weights, state = weights_of(data), WorldState(joints, np.zeros((frames, CAMERA)), shared)
