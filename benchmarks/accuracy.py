@@ -48,8 +48,7 @@ from drocap_ros.evaluation.tables import rotation_markdown, world_markdown
 from drocap_ros.evaluation.world import world_study
 from drocap_ros.evaluation.world_protocol import NONE, WorldCase, world_sequences
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.simulation.orbit_camera import project, to_camera
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
 from drocap_ros.tracks import Tracks

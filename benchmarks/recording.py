@@ -184,7 +184,7 @@ def cell_write_long(minutes: str, folder: str) -> dict[str, Any]:
     from drocap_ros.recording.mcap.schemas import schema_text
     from drocap_ros.recording.mcap.writer import SessionWriter
     from drocap_ros.simulation.capture import simulate_capture
-    from drocap_ros.simulation.vehicle.flight_path import SampledPath
+    from drocap_ros.simulation.vehicle.mavlink_vehicle import SampledPath
 
     messages, capture = Messages(), simulate_capture(60.0, 30.0, seed=5, start_ns=START_NS)
     tracks = capture.tracks

@@ -22,7 +22,7 @@ LAYERS = (
 )  # fmt: skip
 ROS_ROOMS = {"ros", "nodes", "bringup"}
 ROS_PACKAGES = ("rclpy", "drocap_ros.msg", "drocap_ros.srv")
-MAX_LINES = 350
+MAX_LINES = 450
 #: Most lines of Python per room, in thousands: what there was, up to the next 50.  A feature pays for its lines by what
 #: it makes needless; who raises a budget writes the reason beside the number.  The plan is issue 45's.
 BUDGETS = {

@@ -6,12 +6,11 @@ import math
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.observed import Course, Health, Link, Mode, Motion, Observed, Pictures, Subject
 from drocap_ros.flight.orbit.safety import reduce
 from drocap_ros.flight.orbit.states import Action, Command, Limits, SafetyState, State
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.safety_config import SafetyConfig
 
 LIMITS = Limits(SafetyConfig(commands_enabled=True, mode_change_allowed=True), OrbitConfig())
 #: Parts of an observation and fields of theirs by short names, with which :func:`changed` sets them.

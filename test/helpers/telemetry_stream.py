@@ -12,8 +12,7 @@ from drocap_ros.evaluation.world_scene import PinholePath, followed_points
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.skeleton import BODY_17
 
 FPS = 15.0

@@ -16,8 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, coast_of
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, Setpoint, coast_of
 from drocap_ros.flight.autopilot.simulated import Simulated
 
 

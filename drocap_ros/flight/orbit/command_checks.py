@@ -6,12 +6,16 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-from drocap_ros.flight.bridge_config import FENCE_ROOM_M, MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import (
+    FENCE_ROOM_M,
+    MavlinkBridgeConfig,
+    OrbitGoal,
+    goal_of,
+    height_condition,
+    orbit_condition,
+)
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.states import Command, CommandAnswer, OperatorCommand, SafetyState, State
-from drocap_ros.flight.orbit_config import orbit_condition
-from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
-from drocap_ros.flight.safety_config import height_condition
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.stamps import NS
 

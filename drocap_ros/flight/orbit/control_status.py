@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import WORTH_TELLING, MavlinkBridgeConfig, OrbitGoal
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.planner import OrbitState
 from drocap_ros.flight.orbit.states import Action, CommandAnswer, OperatorCommand, State
-from drocap_ros.flight.orbit_goal import WORTH_TELLING, OrbitGoal
 
 _CLEAR = (
     "clear of min_distance_m, {:g} m, if the range is wrong; size_error, {:g}, may be 0.04 where body_height_m is the"

@@ -12,12 +12,18 @@ import threading
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint, hold_setpoint
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
-from drocap_ros.flight.mavlink.commands import CommandQueue
+from drocap_ros.flight.mavlink.commands import (
+    GIMBAL_PITCH,
+    SET_MODE,
+    CommandQueue,
+    command_message,
+    halt_message,
+    setpoint_message,
+)
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.messages import GIMBAL_PITCH, SET_MODE, command_message, halt_message, setpoint_message
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.command_checks import CommandDesk
 from drocap_ros.flight.orbit.control_status import ControlStatus

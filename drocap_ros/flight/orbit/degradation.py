@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import (

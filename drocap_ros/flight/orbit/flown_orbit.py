@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
-from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.autopilot.coasting import Setpoint
+from drocap_ros.flight.bridge_config import HEIGHT_ROOM_M, MavlinkBridgeConfig, OrbitGoal, goal_of
 from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.command_checks import Order
@@ -22,8 +22,6 @@ from drocap_ros.flight.orbit.planner import (
     setpoint_of,
 )
 from drocap_ros.flight.orbit.states import Limits, SafetyState
-from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
-from drocap_ros.flight.safety_config import HEIGHT_ROOM_M
 from drocap_ros.flight.subject.framing import Framing
 
 _SURE_SIZES = 3.0  # of size_error, beyond which the picture contradicts the height

@@ -7,13 +7,13 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.bridge_config import SafetyConfig
 from drocap_ros.flight.conditions import PICTURE_CODES, Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import subject_located
 from drocap_ros.flight.orbit.sight import UNSEEN_S
 from drocap_ros.flight.orbit.states import Limits, SafetyState, State
-from drocap_ros.flight.safety_config import SafetyConfig
 
 _AT_REST_M_S = 0.35  # below it a vehicle stands, by a velocity that errs by as much
 _SETTLED_S = 0.3  # slow for so long: a vehicle that springs back is slow for a moment where it turns

@@ -14,13 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.autopilot.autopilot import greatest_speed
-from drocap_ros.flight.autopilot.coasting import Coast
-from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
+from drocap_ros.flight.autopilot.coasting import Coast, Setpoint, hold_setpoint
+from drocap_ros.flight.bridge_config import WORTH_TELLING, OrbitGoal
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed, SizeSight
 from drocap_ros.flight.orbit.motion_checks import OWN_SPEED_SD_M_S, REACTION_S
 from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.orbit_goal import WORTH_TELLING, OrbitGoal
 from drocap_ros.flight.subject.guard import farness
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 

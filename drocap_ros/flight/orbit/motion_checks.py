@@ -9,11 +9,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import supported_titles
 from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
+from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.flight.observed import FIX_3D, Observed
 from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.safety_config import SafetyConfig
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
 _C = ConditionCode

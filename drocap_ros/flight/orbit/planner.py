@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint
+from drocap_ros.flight.bridge_config import OrbitConfig, OrbitGoal
 from drocap_ros.flight.orbit.motion_checks import REACTION_S
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.orbit_goal import OrbitGoal
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
 _TRIM_RATE = 0.15  # 1/s, about one who stands

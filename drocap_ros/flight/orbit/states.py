@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.safety_config import SafetyConfig
 
 
 class State(enum.IntEnum):

@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from orbit_observations import GOOD, LIMITS, changed, orbiting
 
-from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig, OrbitGoal
 from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
 from drocap_ros.flight.orbit.safety import reduce
 from drocap_ros.flight.orbit.states import Command, OperatorCommand, SafetyState
-from drocap_ros.flight.orbit_goal import OrbitGoal
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 
 CONFIG = MavlinkBridgeConfig()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, changed, orbiting
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace, slowed
 from drocap_ros.flight.orbit.safety import permit_mode, reduce

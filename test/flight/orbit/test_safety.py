@@ -8,12 +8,12 @@ from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, changed, orbiting
 
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.autopilot.autopilot import LossSettings
+from drocap_ros.flight.bridge_config import SafetyConfig
 from drocap_ros.flight.conditions import ConditionCode, condition
 from drocap_ros.flight.orbit.motion_checks import battery_condition
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
 from drocap_ros.flight.orbit.way_out import way_out
-from drocap_ros.flight.safety_config import SafetyConfig
 
 BAD = {
     "disturbance": {"disturbance": condition(ConditionCode.CLOCK_JUMPED, jump_s=3.0)},

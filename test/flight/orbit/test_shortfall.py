@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from orbit_observations import GOOD, changed
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.orbit.last_setpoint import Shortfall
 
 HERE, SUBJECT = np.array([6.0, 0.0, 2.5]), np.zeros(3)
