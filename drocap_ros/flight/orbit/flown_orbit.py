@@ -21,7 +21,7 @@ from drocap_ros.flight.orbit.planner import (
     reference_position,
     setpoint_of,
 )
-from drocap_ros.flight.orbit.states import Limits, SafetyState
+from drocap_ros.flight.orbit.states import Limits, Orbiting
 from drocap_ros.flight.subject.framing import Framing
 
 _SURE_SIZES = 3.0  # of size_error, beyond which the picture contradicts the height
@@ -63,7 +63,7 @@ class FlownOrbit:
         """No orbit is flown."""
         self._reference = self.unsafe = None
 
-    def setpoint(self, seen: Observed, safety: SafetyState, framing: Framing, dt: float) -> Setpoint | None:
+    def setpoint(self, seen: Observed, safety: Orbiting, framing: Framing, dt: float) -> Setpoint | None:
         """The setpoint of this step, ``dt`` s after the last one; None where no orbit is flown."""
         if self._reference is None or seen.subject.position is None:
             return None
