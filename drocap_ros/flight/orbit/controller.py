@@ -27,9 +27,9 @@ from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.command_checks import CommandDesk
 from drocap_ros.flight.orbit.control_status import ControlStatus
-from drocap_ros.flight.orbit.flown_orbit import FlownOrbit
 from drocap_ros.flight.orbit.observer import Observer, OwnFlight
 from drocap_ros.flight.orbit.safety import permit_mode, reduce, way_out
+from drocap_ros.flight.orbit.setpoint import FlownOrbit
 from drocap_ros.flight.orbit.states import (
     Action,
     Fault,

@@ -9,7 +9,6 @@ import numpy as np
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
-from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace
 from drocap_ros.flight.orbit.hold import (
     begin_hold,
     foreign_mode,
@@ -29,6 +28,7 @@ from drocap_ros.flight.orbit.motion_checks import (
     subject_condition,
     vehicle_condition,
 )
+from drocap_ros.flight.orbit.speed import allowed_pace, next_pace
 from drocap_ros.flight.orbit.states import (
     Action,
     Command,

@@ -8,8 +8,8 @@ from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, changed, orbiting
 
 from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace, slowed
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
+from drocap_ros.flight.orbit.speed import allowed_pace, next_pace, slowed
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, Pace, State
 
 RESUMING = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, resume_after_hold_s=6.0))

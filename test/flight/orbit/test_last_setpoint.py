@@ -13,7 +13,8 @@ from drocap_ros.flight.autopilot.px4 import PX4
 from drocap_ros.flight.bridge_config import OrbitConfig, OrbitGoal, SafetyConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed
-from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
+from drocap_ros.flight.orbit.setpoint import harmless
+from drocap_ros.flight.orbit.speed import coast_speed, slowed_condition
 from drocap_ros.flight.orbit.states import Limits
 
 LIMITS = Limits(SafetyConfig(), OrbitConfig())
