@@ -6,7 +6,6 @@ import string
 
 import pytest
 
-from drocap_ros.flight import conditions
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.states import Command, CommandAnswer, State
 
@@ -30,14 +29,12 @@ def test_constants_of_the_messages_equal_the_enums(root):
 
 
 def test_every_code_has_a_different_sentence():
-    sentences = conditions._SENTENCES
-    assert set(sentences) == set(ConditionCode)
-    assert len(set(sentences.values())) == len(sentences)
+    assert len({code.sentence for code in ConditionCode}) == len(ConditionCode)
 
 
 @pytest.mark.parametrize("code", ConditionCode)
 def test_a_sentence_contains_the_measured_values(code):
-    fields = [(name, form) for _, name, form, _ in string.Formatter().parse(conditions._SENTENCES[code]) if name]
+    fields = [(name, form) for _, name, form, _ in string.Formatter().parse(code.sentence) if name]
     values = {name: 4.25 if form else "word" for name, form in fields if name != "ago"}
     text = str(Condition(code, {**values, "age_s": 4.25}))
     assert "{" not in text

@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.rivals import Rivals
+from drocap_ros.flight.orbit.command_checks import Rivals
 
 
 def code(rivals, now_s):
