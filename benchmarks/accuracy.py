@@ -1,18 +1,14 @@
 """Accuracy studies over MoCap and simulation: `python benchmarks/accuracy.py`, or some of its parts by name.
 
-rotation     every method at four orbit speeds, clean and noisy 2D (`drocap evaluate rotation`): page accuracy
+rotation     every method at four orbit speeds, clean and noisy 2D (`python -m lab rotation`): page accuracy
 live         the live method beside the offline one, clean and noisy 2D: page accuracy_live
 live-world   the live method in the world beside the offline one, every third sequence: page accuracy_live_world
 perspective  the default method with a camera 6 m and 10 m away, lens known and unknown: page accuracy_perspective
-near         cameras from 3.3 m on, exact 2D; lens, rotation and position known or not, the lens assumed; the
-             camera pitched, rolled and turned aside: page accuracy_near
 world        placement and scale from telemetry, on simulated captures: page accuracy_world
-telemetry    the motion in the world by telemetry that errs (`drocap evaluate world`), every third sequence: page
+telemetry    the motion in the world by telemetry that errs (`python -m lab world`), every third sequence: page
              accuracy_telemetry
 together     two cameras 120 degrees apart whose times and places nobody knows (`drocap reconstruct A B --together`),
              every third sequence: page accuracy_together
-colmap       turns of the camera from the picture alone against COLMAP's on the same drone videos, which needs
-             `pip install pycolmap` and an hour: page accuracy_colmap
 real         phone videos with optical MoCap (``--models DIR`` of the 2D networks): page accuracy_real
 calibration  gimbal yaw and latency found from telemetry that errs, an orbit that reverses once, `--runs` flights: page
              accuracy_calibration
@@ -31,11 +27,20 @@ from pathlib import Path
 import numpy as np
 from figures import ROOT, table, write_figures
 
-from drocap_ros.cli.progress import progress_bars
+from drocap_ros.cli.running import progress_bars
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
-from drocap_ros.evaluation.protocol import (
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
+from drocap_ros.simulation.orbit_camera import project, to_camera
+from drocap_ros.skeleton import BODY_15, BODY_17, indices
+from drocap_ros.tracks import Tracks
+from lab.studies.calibration import calibration_markdown, calibration_study
+from lab.studies.live_study import live_study
+from lab.studies.live_study_table import live_markdown
+from lab.studies.live_world import live_world_markdown, live_world_study
+from lab.studies.protocol import (
     FPS,
     IMAGE_SIZE,
     NOISE_MM,
@@ -43,23 +48,11 @@ from drocap_ros.evaluation.protocol import (
     orbit_rotations,
     protocol_sequences,
 )  # fmt: skip
-from drocap_ros.evaluation.rotation import rotation_study
-from drocap_ros.evaluation.tables import rotation_markdown, world_markdown
-from drocap_ros.evaluation.world import world_study
-from drocap_ros.evaluation.world_protocol import NONE, WorldCase, world_sequences
-from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
-from drocap_ros.simulation.orbit_camera import project, to_camera
-from drocap_ros.skeleton import BODY_15, BODY_17, indices
-from drocap_ros.tracks import Tracks
-from lab.studies.calibration import calibration_markdown, calibration_study
-from lab.studies.colmap_camera import colmap_markdown, colmap_study
-from lab.studies.live_study import live_study
-from lab.studies.live_study_table import live_markdown
-from lab.studies.live_world import live_world_markdown, live_world_study
-from lab.studies.near_camera import DISTANCES_M, NearCamera, error_mm, known, without_camera
 from lab.studies.real_people import SYSTEMS, real_people_study
+from lab.studies.rotation import rotation_markdown, rotation_study
 from lab.studies.together import together_markdown, together_study
+from lab.studies.world import world_markdown, world_study
+from lab.studies.world_protocol import NONE, WorldCase, world_sequences
 
 SPEED_DEG_S = 25.0
 SOLUTION_DELAY_S = 0.5
@@ -127,34 +120,6 @@ def perspective(args: argparse.Namespace) -> None:
     head = ["distance", "2D", "ba, lens unknown", "ba, lens known (`camera_matrix`)", "initial"]
     text = f"Reconstruction error in mm, mean over {len(sequences)} sequences, {SPEED_DEG_S:g} deg/s.\n\n"
     write_figures("accuracy_perspective", "Accuracy with a camera nearby", text + table(head, rows))
-
-
-def near(args: argparse.Namespace) -> None:
-    """Errors by distance and knowledge, and of cameras that are rolled, pitched and turned aside."""
-    sequences = protocol_sequences(args.mocap, limit=args.limit)[::2]
-    cases = [
-        (
-            ", ".join(name for name, use in zip(("lens", "rotation", "position"), case, strict=True) if use)
-            or "nothing",
-            case,
-        )
-        for case in ((False,) * 3, (True, False, False), (False, True, False), (True, True, False), (True,) * 3)
-    ]
-    rows = []
-    for camera in (
-        *(NearCamera(distance, speed) for distance in DISTANCES_M for speed in (0.0, SPEED_DEG_S)),
-        *(NearCamera(DISTANCES_M[0], **{name: deg}) for name, deg in (("roll_deg", 26.0), ("pitch_deg", 40.0))),
-        NearCamera(DISTANCES_M[0], aside_deg=20.0),
-    ):
-        found = [
-            error_mm(sequences, camera, lambda tracks, c=case: known(tracks, lens=c[0], rotation=c[1], position=c[2]))
-            for _, case in cases
-        ]
-        real = error_mm(sequences, camera, lambda tracks: replace(without_camera(tracks), real_lens=True))
-        rows.append([str(camera), *(f"{error:.1f}" for error in (*found, real))])
-    text = f"Error in mm, mean over {len(sequences)} sequences, by what is known of the camera.\n\n"
-    head = ["camera", *(name for name, _ in cases), "lens assumed"]
-    write_figures("accuracy_near", "Near cameras", text + table(head, rows))
 
 
 def world(args: argparse.Namespace) -> None:
@@ -240,17 +205,10 @@ def real(args: argparse.Namespace) -> None:
     write_figures("accuracy_real", "Real people with optical MoCap", text + table(head, list(rows.values())))
 
 
-def colmap(args: argparse.Namespace) -> None:
-    """The camera without telemetry against COLMAP's; of the drone videos beside the MoCap."""
-    models = args.models or ROOT.parent / "shared" / "models"
-    clips = sorted((args.mocap.parents[1] / "aerial").glob("*.mp4"))
-    write_figures("accuracy_colmap", "The camera by the picture alone", colmap_markdown(colmap_study(clips, models)))
-
-
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
-    "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective, "near": near,
+    "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective,
     "world": world, "telemetry": telemetry, "together": together, "calibration": calibration,
-    "real": real, "colmap": colmap,
+    "real": real,
 }  # fmt: skip
 
 
@@ -263,7 +221,7 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=20, help="flights of the calibration study (default 20)")
     words = "fixed points of the scene in the calibration study (default both)"
     parser.add_argument("--background", choices=("without", "with", "both"), default="both", help=words)
-    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=2, help="of the rotation study (default 2)")
     args = parser.parse_args()
     status = 0
     for part in args.parts or PARTS:

@@ -3,20 +3,16 @@
 kills    `--recordings 200` (default 20) tracks and short videos, a twentieth of them broken; SIGKILL three times
 cluster  the same on a local Dask cluster; also a killed worker, and a recording that exceeds a worker's memory
 equal    the arrays of `reconstruct`, of one process, of four, and of a cluster
-speed    time with one and with two processes in turn, and what other programs used of the machine meanwhile
-scale    10,000 recordings: start, log, page and scheduler, measured; disk and time from the other parts' sizes
 
-Each part writes the page batch_PART of docs/figures.  cluster, equal and scale need dask.distributed.
+Each part writes the page batch_PART of docs/figures.  cluster and equal need dask.distributed.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
@@ -31,9 +27,8 @@ import numpy as np
 from batch_season import make_season
 from figures import ROOT, table, write_figures
 
-PARTS = ("kills", "cluster", "equal", "speed", "scale")
+PARTS = ("kills", "cluster", "equal")
 WORKER_MEMORY = "700MiB"
-SPEED_ROUNDS = 3
 Fault = Callable[[], None]
 
 
@@ -42,7 +37,6 @@ def main() -> int:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
     parser.add_argument("--recordings", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the tracks")
-    parser.add_argument("--scale", type=int, default=10_000)
     args = parser.parse_args()
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     for part in args.parts or PARTS:
@@ -220,126 +214,6 @@ def arrays_of(path: Path) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
     with np.load(path) as archive:
         arrays = {name: archive[name] for name in archive.files if name != "meta"}
     return {name: (str(array.dtype), array.shape, array.tobytes()) for name, array in arrays.items()}
-
-
-# -- speed -------------------------------------------------------------------------------------------------
-
-
-def part_speed(args: argparse.Namespace, folder: Path) -> None:
-    count = min(args.recordings, 48)
-    make_season(folder / "season", count, args.seconds)
-    rows: list[tuple[object, ...]] = []
-    seconds: dict[int, list[float]] = {1: [], 2: []}
-    for jobs in (1, 2) * SPEED_ROUNDS:
-        before, others, begin = load(), other_programs_s(), time.monotonic()
-        finish(batch(folder / "season", folder / f"out{len(rows)}", "--jobs", jobs))
-        wall = time.monotonic() - begin
-        seconds[jobs].append(wall)
-        others = (other_programs_s() - others) / wall
-        rows.append((jobs, f"{wall:.1f} s", f"{wall / count:.2f} s", f"{others:.2f}", before, load()))
-    write_figures(
-        "batch_speed",
-        "Speed-up of a batch",
-        f"{count} recordings of {args.seconds:g} s. Speed-up of two processes over one, from the fastest run of each:"
-        f" **{min(seconds[1]) / min(seconds[2]):.2f}**; from all runs: {sum(seconds[1]) / sum(seconds[2]):.2f}.\n\n"
-        + table(("jobs", "time", "per recording", "cores used by other programs", "load before", "load after"), rows),
-    )
-
-
-def other_programs_s() -> float:
-    """Processor time so far of the machine's processes outside this one's session."""
-    import psutil
-
-    total = 0.0
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error, ProcessLookupError):
-            # The first process inherits the times of the batches' orphans.
-            if process.pid != 1 and os.getsid(process.pid) != os.getsid(0):
-                total += sum(process.cpu_times()[:4])
-    return total
-
-
-# -- scale -------------------------------------------------------------------------------------------------
-
-
-def part_scale(args: argparse.Namespace, folder: Path) -> None:
-    """Fabricated results of `--scale` recordings around one real result of each kind."""
-    import psutil
-    from distributed import Client
-
-    from drocap_ros.cli import build_parser
-    from drocap_ros.cli.batch.command import _read_tasks
-    from drocap_ros.cli.batch.recording import reconstruct_recording
-
-    make_season(folder / "real", 20, args.seconds)
-    finish(batch(folder / "real", folder / "real_out", "--jobs", 2))
-    records = [record for record in log_lines(folder / "real_out") if record["status"] == "done"]
-    sizes = {}
-    for kind in ("walk", "clip"):
-        own = [record for record in records if Path(record["input"]).name.startswith(kind)]
-        disk = [sum(f.stat().st_size for f in (folder / "real_out" / r["folder"]).iterdir()) for r in own]
-        sizes[kind] = (np.mean(disk) / 1e6, np.mean([r["seconds"] for r in own]), max(r["peak_memory_mb"] for r in own))
-
-    many, out = folder / "many", folder / "many_out"
-    many.mkdir()
-    out.mkdir()
-    for i in range(args.scale):
-        os.link(folder / "real" / "walk_000.npz", many / f"walk_{i:05}.npz")
-    parsed = build_parser().parse_args(["batch", str(many), "--out", str(out), "--models", "simulation"])
-    parsed.command_line = "drocap batch"
-    tasks = _read_tasks(parsed)
-    lines = []
-    for i, task in enumerate(tasks):
-        record = {**records[i % len(records)], **task.record, "folder": f"walk_{i:05}-0123456789abcdef"}
-        (out / record["folder"]).mkdir()
-        (out / record["folder"] / "record.json").write_text(json.dumps(record))
-        lines.append(json.dumps(record) + "\n")
-    (out / "batch.jsonl").write_text("".join(lines))
-    begin = time.monotonic()
-    process = batch(many, out)
-    peak = 0.0
-    while process.poll() is None:
-        try:
-            peak = max(peak, psutil.Process(process.pid).memory_info().rss / 1e6)
-        except psutil.NoSuchProcess:
-            break
-        time.sleep(0.02)
-    print(finish(process))
-    start_s = time.monotonic() - begin
-
-    words = ["scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(folder / "file")]
-    scheduler = subprocess.Popen([sys.executable, "-m", "dask", *words], stderr=subprocess.DEVNULL)
-    while not (folder / "file").exists():
-        time.sleep(0.1)
-    with Client(scheduler_file=str(folder / "file")) as client:
-        memory = [psutil.Process(scheduler.pid).memory_info().rss / 1e6]
-        begin = time.monotonic()
-        futures = client.map(reconstruct_recording, tasks, pure=False)
-        while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)) < len(tasks):
-            time.sleep(0.1)
-        submit_s = time.monotonic() - begin
-        memory.append(psutil.Process(scheduler.pid).memory_info().rss / 1e6)
-        del futures
-    scheduler.terminate()
-    scheduler.wait()
-
-    n = args.scale
-    rows = [
-        ("start that finds everything done", f"{start_s:.1f} s, {peak:.0f} MB"),
-        ("`batch.jsonl`", f"{(out / 'batch.jsonl').stat().st_size / 1e6:.1f} MB"),
-        ("`summary.html`", f"{(out / 'summary.html').stat().st_size / 1e6:.1f} MB"),
-        ("scheduler with all of them waiting", f"{memory[1]:.0f} MB, {memory[0]:.0f} MB without; {submit_s:.1f} s"),
-    ]
-    for kind, what in (("walk", f"tracks of {args.seconds:g} s"), ("clip", "videos of 1.5 s")):
-        disk, seconds, most = sizes[kind]
-        rows.append((
-            f"{what}: folders, computing, most memory of one",
-            f"{disk * n / 1e3:.1f} GB ({disk:.2f} MB each), {seconds * n / 3600:.1f} core hours ({seconds:.1f} s each),"
-            f" {most:.0f} MB",
-        ))  # fmt: skip
-    text = "Start, log, page and scheduler are measured, folders and computing extrapolated from a few recordings.\n\n"
-    write_figures("batch_scale", f"{n} recordings", text + table(("of all recordings", ""), rows))
-    shutil.rmtree(many)
 
 
 if __name__ == "__main__":

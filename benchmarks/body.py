@@ -18,24 +18,25 @@ from scipy.signal import lfilter
 
 from drocap_ros.contacts import TRUE_REST_M_S
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.protocol import (
+from drocap_ros.evaluation.truth_files import load_mocap
+from drocap_ros.geometry.alignment import apply_similarity, similarity
+from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.network import LifterInput
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, indices
+from drocap_ros.tracks import Tracks
+from lab.studies.protocol import (
     FPS,
     IMAGE_SIZE,
     NOISE_MM,
     OUTLIER_PROBABILITY,
     OUTLIER_RANGE_MM,
     PX_PER_MM,
+    mocap_files,
     orbit_rotations,
     resample,
 )  # fmt: skip
-from drocap_ros.geometry.alignment import apply_similarity, similarity
-from drocap_ros.geometry.ellipsoids import unpack_covariance
-from drocap_ros.mocap import load_mocap, mocap_files
-from drocap_ros.reconstruction.lifted.lifter import Lifter
-from drocap_ros.reconstruction.lifted.network import LifterInput
-from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, indices
-from drocap_ros.tracks import Tracks
 from lab.training.leg_lengths import leg_reach, refit_knees, shortening
 
 SPEED_DEG_S = 25.0

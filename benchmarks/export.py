@@ -120,8 +120,7 @@ def moved_joints(motions: list[Path]) -> str:
 
 def locked_feet(motions: list[Path]) -> str:
     from drocap_ros.errors import InputError
-    from drocap_ros.export.cleaning import lock_feet
-    from drocap_ros.export.take import at_constant_rate, take_of
+    from drocap_ros.export.take import at_constant_rate, lock_feet, take_of
     from drocap_ros.motion import load_motion
 
     rows = []

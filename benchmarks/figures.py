@@ -2,23 +2,6 @@
 
 A page names the machine, the date, the revision and the command, so that two pages can be compared.  Short runs belong
 elsewhere: `DROCAP_FIGURES=DIR` writes the pages to DIR instead of docs/figures.
-
-One page per part that can run alone:
-
-    demo.py             demo
-    accuracy.py         accuracy, accuracy_live, accuracy_perspective, accuracy_world, accuracy_telemetry
-    body.py             accuracy_body
-    batch.py            batch_kills, batch_cluster, batch_equal, batch_speed, batch_scale
-    export.py           export
-    reconstruction.py   reconstruction
-    perception.py       perception
-    perception_scenes.py perception_scenes
-    peers.py            peers
-    perception_people.py perception_people
-    recording.py        recording_load, recording_kills, recording_mutations, recording_long, recording_live
-    live.py             live_load, live_memory, live_kills
-    flight_*.py         flight_faults, flight_processes, flight_orbits, flight_quality, flight_pixels, flight_fuzz,
-                        flight_replay, flight_field, flight_kills, flight_pilot, flight_choices
 """
 
 from __future__ import annotations

@@ -4,11 +4,10 @@ load    a 1280x720 video at 30 fps in a loop through all nodes, with adjustment 
         from the image's stamp to pose3d/initial, the adjustment's duration, processor time, with the adjuster and
         without (`--seconds 300`; `--processes` or `--one-process`, `--no-adjuster` for one case; `--seamless`: no
         cuts, so that a subject is tracked all the time)
-memory  resident memory of every process compared with its value at minute 2 (`--minutes 30`)
 kills   SIGKILL of each node in turn, a person in view all the time: time until it works again, gaps in the recording
         (`--rounds 5`)
 
-Needs ../shared (video, weights).  Writes docs/figures/live_load.md, live_memory.md and live_kills.md.  Run it on an
+Needs ../shared (video, weights).  Writes docs/figures/live_load.md and live_kills.md.  Run it on an
 idle machine; the load average before each part is among its figures.
 """
 
@@ -34,7 +33,6 @@ sys.path[:0] = [str(ROOT)]
 SHARED = ROOT.parent / "shared"
 TITLES = {
     "load": "Live graph under load",
-    "memory": "Memory of the live graph",
     "kills": "Restart of killed nodes",
 }
 PARTS = tuple(TITLES)
@@ -47,7 +45,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--threads", type=int, default=1, help="of the networks: 1 is the best on two cores")
     parser.add_argument("--pose-model", default="auto", help="file in the models folder; auto = the most accurate")
@@ -299,48 +296,6 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
         name: number - int(first.get(name, {}).get(Key.IMAGES, 0)) for name, number in seen.items() if number
     }
     return figures
-
-
-# -- memory ------------------------------------------------------------------------------------------------
-
-
-def part_memory(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Resident memory of each process of the whole graph, every 5 s."""
-    from drocap_ros.bringup import bringup
-    from drocap_ros.simulation.vehicle.loopback import free_udp_port
-
-    video, session, port = stream(folder), folder / "session", free_udp_port()
-    # A file a minute, of which the old ones go: half an hour would fill a disk.
-    config = graph_config(video, session, port).replace("session_recorder", split_s=60.0)
-    nodes = [*NODES[:-1], "visualizer", "session_recorder"]
-    load = os.getloadavg()[0]
-    results: dict[str, Any] = {"minutes": args.minutes, "load average before": round(load, 2)}
-    with vehicle(port), bringup(config, nodes, processes=not args.one_process, respawn=True) as graph:
-        pids = {graph.pid(name): name if not args.one_process else "all nodes" for name in nodes}
-        seen: dict[int, list[tuple[float, float]]] = {pid: [] for pid in pids}
-        begin = time.monotonic()
-        while (now := time.monotonic() - begin) < 60 * args.minutes:
-            graph.spin_for(5.0)
-            for pid, values in seen.items():
-                values.append((now, usage(pid)[1]))
-            for old in sorted(session.glob("*.mcap"), key=lambda p: int(p.stem.rsplit("_", 1)[1]))[:-2]:
-                old.unlink()
-    good = True
-    for pid, values in seen.items():
-        at_two = next(mib for now, mib in values if now >= min(120.0, 30.0 * args.minutes))
-        later = [mib for now, mib in values if now >= min(120.0, 30.0 * args.minutes)]
-        far = max(later, key=lambda mib: abs(mib - at_two))
-        within = abs(far / at_two - 1) <= 0.05
-        good &= within
-        results[pids[pid]] = {
-            "MiB at minute 2": round(at_two, 1),
-            "at the end": round(values[-1][1], 1),
-            "farthest": f"{100 * (far / at_two - 1):+.1f} %",
-            "every minute": [round(mib) for now, mib in values if now % 60 < 5.0],
-        }
-    results["verdict"] = "within 5 % of minute 2" if good else "NOT within 5 % of minute 2"
-    show(f"memory, {args.minutes:g} minutes", results)
-    return results
 
 
 # -- kills -------------------------------------------------------------------------------------------------

@@ -106,12 +106,12 @@ def synthetic_tracks(frames: int) -> Any:
 
 
 def world_tracks(frames: int) -> Any:
-    """A walking person, seen and measured by a drone with the errors of GPS (`drocap evaluate world`)."""
+    """A walking person, seen and measured by a drone with the errors of GPS (`python -m lab world`)."""
     import numpy as np
 
-    from drocap_ros.evaluation.world_protocol import FPS, WorldCase, world_view
-    from drocap_ros.mocap import Sequence
     from drocap_ros.simulation.simulated_person import simulate_person
+    from lab.studies.protocol import Sequence
+    from lab.studies.world_protocol import FPS, WorldCase, world_view
 
     person = simulate_person(np.arange(frames) / FPS, action="walk", seed=0)
     return world_view(Sequence("walk", 1000.0 * person), WorldCase("gps")).tracks

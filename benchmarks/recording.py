@@ -3,7 +3,6 @@
 load       recorder node under 1280x720 JPEG 30 Hz + poses 30 Hz + telemetry 50 Hz (`--seconds 300` for the full time)
 kills      SIGKILL at random moments, recover, read by three libraries (`--kills 200`)
 mutations  mutated copies of a session, tracks and every telemetry format (`--mutations 1000`, `--kinds mp4 csv`)
-long       a session of `--minutes 30` against one of a minute: time per frame, memory
 live       a simulated flight of `--flight 60` s, repeated offline bit for bit
 
 Each part runs in its own processes, so that memory and processor time are those of the part.  Each part writes the page
@@ -31,7 +30,7 @@ from mutated_files import KINDS, mutations
 from recorder_load import make_sources, process_usage, publish_all, watch_process
 
 sys.path[:0] = [str(ROOT), str(ROOT / "test" / "helpers")]
-PARTS = ("load", "kills", "mutations", "long", "live")
+PARTS = ("load", "kills", "mutations", "live")
 
 
 def main() -> int:
@@ -41,7 +40,6 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--mutations", type=int, default=100)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="only these are printed, not written")
-    parser.add_argument("--minutes", type=int, default=5)
     parser.add_argument("--flight", type=float, default=20.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cell", nargs="+", help=argparse.SUPPRESS)
@@ -163,75 +161,6 @@ def part_kills(args: argparse.Namespace, folder: Path) -> None:
     )
 
 
-# -- long sessions -----------------------------------------------------------------------------------------
-
-
-def part_long(args: argparse.Namespace, folder: Path) -> None:
-    rows = []
-    for minutes in (1, args.minutes):
-        session = folder / f"session{minutes}"
-        cell("write_long", minutes, session)
-        rows += [(minutes, what, *cell("long", what, session).values()) for what in ("read", "ba")]
-    head = ("minutes", "stage", "frames", "ms/frame", "memory, MiB", "memory at the start, MiB")
-    write_figures("recording_long", "Long sessions", table(head, rows))
-
-
-def cell_write_long(minutes: str, folder: str) -> dict[str, Any]:
-    """Repeats one simulated minute, with telemetry at 50 Hz."""
-    import numpy as np
-    from recorded import NAMES, START_NS, Messages
-
-    from drocap_ros.recording.mcap.schemas import schema_text
-    from drocap_ros.recording.mcap.writer import SessionWriter
-    from drocap_ros.simulation.capture import simulate_capture
-    from drocap_ros.simulation.vehicle.mavlink_vehicle import SampledPath
-
-    messages, capture = Messages(), simulate_capture(60.0, 30.0, seed=5, start_ns=START_NS)
-    tracks = capture.tracks
-    path = SampledPath((tracks.stamp_ns - START_NS) * 1e-9, capture.camera_rotation, capture.camera_position)
-    poses = [messages.pose2d(tracks, i, START_NS) for i in range(len(tracks))]
-    states = [path.at(s) for s in np.arange(0, 60, 0.02)]
-    with SessionWriter(folder) as writer:
-        for name in ("pose2d", "state"):
-            writer.register(f"/drocap/{name}", NAMES[name], schema_text(NAMES[name]))
-        for minute in range(int(minutes)):
-            base_ns = START_NS + minute * 60 * 10**9
-            for i, pose in enumerate(poses):
-                pose.header = messages.header(base_ns + round(i / 30 * 1e9))
-                writer.write("/drocap/pose2d", messages.cdr(pose), base_ns + round(i / 30 * 1e9))
-            for i, state in enumerate(states):
-                stamp_ns = base_ns + i * 20_000_000
-                message = messages(
-                    NAMES["state"], header=messages.header(stamp_ns, "map"), position_enu_m=state.position_enu_m,
-                    orientation=messages.quaternion(state.orientation_xyzw),
-                    gimbal_orientation=messages.quaternion(state.gimbal_orientation_xyzw),
-                )  # fmt: skip
-                writer.write("/drocap/state", messages.cdr(message), stamp_ns)
-            while writer.queued_bytes > 8 << 20:
-                time.sleep(0.05)
-    assert writer.dropped == 0
-    return {"messages": writer.written}
-
-
-def cell_long(what: str, folder: str) -> dict[str, Any]:
-    from drocap_ros.config import DrocapConfig
-    from drocap_ros.pipeline import read_input, reconstruct_input
-
-    base_mib, begin = peak_mib(), time.process_time()
-    if what == "read":
-        frames = len(read_input(Path(folder), DrocapConfig(), None)[0])
-    else:
-        motion, _ = reconstruct_input(folder, method=what, config=DrocapConfig())
-        frames = len(motion.joints3d)
-    seconds = time.process_time() - begin
-    return {
-        "frames": frames,
-        "ms_per_frame": round(1e3 * seconds / frames, 4),
-        "peak_mib": round(peak_mib()),
-        "base_mib": round(base_mib),
-    }
-
-
 # -- live against offline ----------------------------------------------------------------------------------
 
 
@@ -258,7 +187,7 @@ def part_live(args: argparse.Namespace, folder: Path) -> None:
     )
 
 
-CELLS = {"mutations": mutations, "write_long": cell_write_long, "long": cell_long}
+CELLS = {"mutations": mutations}
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -28,7 +28,7 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.parameters import Values
-from drocap_ros.reconstruction.common.threads import blas_threads
+from drocap_ros.reconstruction.common.engine import blas_threads
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.graph import Graph, Runner
 from drocap_ros.ros.lockstep import Lockstep

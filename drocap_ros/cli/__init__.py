@@ -14,13 +14,13 @@ from collections.abc import Sequence
 
 from drocap_ros import __version__
 from drocap_ros.cli.options import LineParser
-from drocap_ros.cli.signals import BOTH, interruptible
+from drocap_ros.cli.running import BOTH, interruptible
 from drocap_ros.errors import DrocapError, InputError
 
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
 COMMANDS = (
     "demo.command", "graph.live", "graph.preflight", "view", "graph.orbit", "graph.record", "graph.replay",
-    "sample", "track", "reconstruct", "batch.command", "learn_dictionary", "export", "report", "info", "recover",
+    "sample", "track", "reconstruct", "batch", "export", "report", "info", "recover",
     "graph.top", "models", "evaluate",
 )  # fmt: skip
 

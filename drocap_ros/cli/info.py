@@ -125,7 +125,7 @@ def _of_arrays(path: Path) -> Summary:
 
 def _motion_facts(motion: Motion) -> list[tuple[str, str]]:
     from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
-    from drocap_ros.report.flexion import flexion_words
+    from drocap_ros.report.movement import flexion_words
     from drocap_ros.report.statistics import scale_of
 
     found = [

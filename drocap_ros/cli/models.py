@@ -186,7 +186,7 @@ def _agreed(lack: str, pair: str) -> bool:
 
 def fetch_models(models: Sequence[KnownModel], folder: Path, *, quiet: bool = False) -> list[str]:
     """Download models and print one line for each; returns the failures of network or server."""
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.running import progress_bars
     from drocap_ros.perception.models.fetch import fetch
     from drocap_ros.perception.models.wheel import FetchError
 

@@ -1,14 +1,16 @@
-"""``drocap reconstruct``: 3D motion from a video, recording or tracks file."""
+"""``drocap reconstruct``: 3D motion from a video, recording or tracks file, or from several recordings together."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drocap_ros.cli.motion_output import add_all_option, people_of, reconstruct_people
 from drocap_ros.cli.options import (
     Subparsers,
     add_clip_options,
@@ -21,12 +23,13 @@ from drocap_ros.cli.options import (
     image_size,
     rate,
 )
-from drocap_ros.cli.people import add_all_option, people_of, reconstruct_people
 from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
 if TYPE_CHECKING:
+    from drocap_ros.motion import Motion
     from drocap_ros.recording.video_telemetry import Telemetry
+
 
 METHODS = (*OFFLINE, "live")
 #: Stages of the work on a video and their shares of its time, as of a walk of 8 s.
@@ -131,8 +134,6 @@ def run_command(args: argparse.Namespace) -> int:
     """Reconstruct one recording, or several together."""
     if not (args.together or args.further):
         return run(args, people_of(args))
-    from drocap_ros.cli.together import run_together
-
     if args.all:
         raise InputError("--all: expected one recording, found several; leave out --together, or --all")
     return run_together(args)
@@ -144,8 +145,8 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     from drocap_ros.cli.atomic_output import default_folder
     from drocap_ros.cli.models import ensure_networks
     from drocap_ros.cli.motion_output import output_names, summary, write_outputs
-    from drocap_ros.cli.progress import progress_bars
     from drocap_ros.cli.report import open_words
+    from drocap_ros.cli.running import progress_bars
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
@@ -235,3 +236,117 @@ def _check_offset(name: str, value: float, args: argparse.Namespace, *, mount: b
         raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
     if not math.isfinite(value):
         raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
+
+
+#: Options of one recording, and their values where they are not given.
+_OF_ONE = {
+    "method": "ba",
+    "start": 0.0,
+    "end": math.inf,
+    "subject": "",
+    "topic": "",
+    "redetect": False,
+    "time_offset": None,
+    "mount_pitch": None,
+    "camera_pitch": None,
+    "camera_roll": None,
+    "evidence": None,
+}
+#: Of a camera without telemetry and fixed points that moves.
+_BY_BODY = "; its camera moves as the body turns in its pictures"
+
+
+def run_together(args: argparse.Namespace) -> int:
+    """Reconstruct all recordings as one motion, and write it as every camera sees it."""
+    begin = time.perf_counter()
+    from drocap_ros.cli.atomic_output import default_folder
+    from drocap_ros.cli.models import ensure_networks
+    from drocap_ros.cli.motion_output import output_names, summary, write_outputs
+    from drocap_ros.cli.report import open_words
+    from drocap_ros.cli.running import progress_bars
+    from drocap_ros.config import load_config
+    from drocap_ros.perception.load_models import models_folder
+    from drocap_ros.pipeline import needs_networks
+    from drocap_ros.recording.keypoints.files import as_tracks_file
+    from drocap_ros.recording.video_telemetry import Telemetry
+    from drocap_ros.report.motion_images import ImagesBeside, has_images
+    from drocap_ros.together import reconstruct_together
+
+    inputs = [args.input, *args.further]
+    _check(args, inputs)
+    out = args.out or default_folder(args.input, "motion")
+    names = output_names(args, out, clip_of(args))
+    beside = [f"camera_{number}.npz" for number in range(2, len(inputs) + 1)]
+    config = load_config(args.config)
+    if args.dictionary:
+        config = config.replace("initializer", dictionary=str(args.dictionary))
+    with contextlib.ExitStack() as stack:
+        sources = [stack.enter_context(as_tracks_file(path, args.rate, args.image_size)) for path in inputs]
+        progress = stack.enter_context(progress_bars(args.quiet))
+        for source in sources:
+            if needs_networks(source, redetect=False):
+                ensure_networks(models_folder(args.models or config.pose_estimator.models_dir), source, args)
+        found = reconstruct_together(
+            sources,
+            config=config,
+            models=args.models,
+            progress=progress,
+            telemetry=Telemetry(args.telemetry),
+            threads=args.threads,
+        )
+        motions = [
+            dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line}) for motion, _ in found
+        ]
+        video = sources[0] if sources[0] == args.input and has_images(sources[0]) else None
+        images = stack.enter_context(ImagesBeside(video, progress))
+        write_outputs(out, names, motions[0], found[0][1], images.of, motions[1:])
+    if not args.quiet:
+        print(summary(motions[0], "ba", time.perf_counter() - begin))
+        print(view_words(motions[0]))
+        print(f"written: {out}/{', '.join(names)}; as the other cameras see it: {', '.join(beside)}")
+        if "report.html" in names:
+            print(open_words(out / "report.html"))
+    return 0
+
+
+def view_words(motion: Motion) -> str:
+    """A line for each further recording: its time and how well the common body fits it; one where there is no world."""
+    together = motion.meta["together"]
+    lines = []
+    if motion.frame == "camera" and any(view["by_body"] for view in together["views"]):
+        lines.append(
+            "a camera moves, and no recording has telemetry or fixed points of the scene: the poses are right, a path"
+            " through a world is not known; record either with one of the cameras"
+        )
+    for view in together["views"][1:]:
+        first = together["views"][0]["name"]
+        when = "after" if view["offset_s"] >= 0 else "before"
+        lines.append(
+            f"{view['name']}: its first image {abs(view['offset_s']):.3f} s (+- {1e3 * view['offset_std_s']:.1f} ms)"
+            f" {when} that of {first}; keypoints {view['median_px']:.1f} px from the common body,"
+            f" {view['median_px_alone']:.1f} from its own{_BY_BODY if view['by_body'] else ''}"
+        )
+    return "\n".join(lines)
+
+
+def _check(args: argparse.Namespace, inputs: list[Path]) -> None:
+    """Refuse recordings without the option, the option without them, and options of one recording."""
+    from drocap_ros.recording.video_telemetry import NO_TELEMETRY
+
+    if not args.together:
+        raise InputError(
+            f"INPUT: expected one, found {len(inputs)}; add --together where all show one person at the same time, else"
+            " use `drocap batch`"
+        )
+    if len(inputs) < 2:
+        raise InputError("--together: expected two INPUTs at least, found one; name the other recordings too")
+    if len({path.resolve() for path in inputs}) < len(inputs):
+        raise InputError("--together: expected different INPUTs, found the same one twice; name each once")
+    given = [name for name, default in _OF_ONE.items() if getattr(args, name, default) not in (default, None)]
+    if args.telemetry not in (None, NO_TELEMETRY):
+        given.append("telemetry")
+    if given:
+        raise InputError(
+            f"--together: expected whole recordings, got --{given[0].replace('_', '-')}; reconstruct that one alone so,"
+            " then name its tracks.npz here"
+        )

@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     """Repair and print the result of each file."""
     import sys
 
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.running import progress_bars
     from drocap_ros.recording.mcap.recover import recover_session
 
     with progress_bars(args.quiet) as progress:

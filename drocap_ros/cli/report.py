@@ -95,7 +95,7 @@ def _own_video(motion: Motion, places: Sequence[Path]) -> Path | None:
 
 def _save_mp4(out: Path, motion: Motion, video: Path, quiet: bool) -> Path:
     from drocap_ros.cli.atomic_output import output_file
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.running import progress_bars
     from drocap_ros.report.side_by_side import save_side_by_side
 
     with output_file(out, inputs=[video], option="--mp4") as file, progress_bars(quiet) as progress:

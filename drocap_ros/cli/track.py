@@ -7,6 +7,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from drocap_ros.cli.motion_output import add_all_option, people_of, save_people_tracks
 from drocap_ros.cli.options import (
     Subparsers,
     add_clip_options,
@@ -17,7 +18,6 @@ from drocap_ros.cli.options import (
     add_threads_option,
     clip_of,
 )
-from drocap_ros.cli.people import add_all_option, people_of, save_people_tracks
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Track, or find all persons, and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, default_folder, output_folder, refuse_inputs
     from drocap_ros.cli.models import ensure_networks
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.running import progress_bars
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
@@ -154,7 +154,7 @@ def _track(job: _Job) -> str:
         save_tracks(target / name, tracks_from_observations(observations, track_id))
     begin = observations[0].stamp_ns
     changes = [f"{(stamp_ns - begin) * 1e-9:.1f} s: {text}" for stamp_ns, text in estimator.tracker.changes]
-    return "\n".join([_summary(found, len(observations)), *changes[1:], *_overlay_words(drawn.codec)])
+    return "\n".join([_summary(found, len(observations)), *changes[1:]])
 
 
 def _track_people(job: _Job) -> str:
@@ -169,15 +169,7 @@ def _track_people(job: _Job) -> str:
     with drawn if args.overlay else contextlib.nullcontext():
         found = track_people(args.video, config, models, selection, progress, drawn.add if args.overlay else None)
     save_people_tracks(target, found.tracks)
-    return "\n".join([*found.words(), *found.left_out, *_overlay_words(drawn.codec)])
-
-
-def _overlay_words(codec: str) -> list[str]:
-    """A line about the codec where browsers do not play it; no codec = no video."""
-    from drocap_ros.report.video_file import install_words
-
-    plays = not codec or codec == "H.264"
-    return [] if plays else [f"overlay.mp4 is {codec}, which browsers do not play; for H.264 run {install_words()}"]
+    return "\n".join([*found.words(), *found.left_out])
 
 
 def _summary(found: list[tuple[int, int]], frames: int) -> str:

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 from drocap_ros.cli.atomic_output import output_file
 from drocap_ros.cli.options import Subparsers, add_command, read_motion
-from drocap_ros.cli.progress import progress_bars
-from drocap_ros.cli.signals import interruptible
+from drocap_ros.cli.running import interruptible, progress_bars
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:

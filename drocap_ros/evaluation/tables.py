@@ -1,29 +1,128 @@
-"""Errors and results of the studies as CSV, Markdown and plots."""
+"""The paper's tables over a folder of recordings with truth; errors as CSV, Markdown and plots."""
 
 from __future__ import annotations
 
 import csv
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from drocap_ros.evaluation.compare import MotionErrors, WorldErrors
+from drocap_ros.clip import Progress
+from drocap_ros.config import DrocapConfig
+from drocap_ros.errors import InputError
+from drocap_ros.evaluation.compare import TRUTH_SUFFIXES, MotionErrors, WorldErrors, compare, load_truth
 from drocap_ros.evaluation.metrics import JOINT_GROUPS
-from drocap_ros.evaluation.recordings import RecordingRow
-from drocap_ros.evaluation.rotation import RotationRow
-from drocap_ros.evaluation.world import WorldRow, world_means
-from drocap_ros.evaluation.world_protocol import WorldCase
+from drocap_ros.pipeline import reconstruct_input
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_Row = TypeVar("_Row", RotationRow, RecordingRow)
+
+logger = logging.getLogger(__name__)
+
+#: Rows of the paper's table, and the default method.
+PAPER_METHODS = ("mf-nnm", "initial", "paper", "ba")
+#: Inputs of a recording's own folder, the preferred one first.
+_INPUTS = ("tracks.npz", "session")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An input of ``drocap reconstruct`` and the file of its truth."""
+
+    name: str
+    source: Path
+    truth: Path
+
+
+@dataclass(frozen=True)
+class RecordingRow:
+    """One recording by one method."""
+
+    sequence: str
+    method: str
+    errors: MotionErrors
+
+
+def find_recordings(folder: Path) -> list[Recording]:
+    """Recordings with truth, by name.
+
+    One is a folder with ``truth.npz`` (or ``.c3d``, ``.trc``, ``.bvh``) and ``tracks.npz``, ``session`` or one other
+    input, such as that of ``drocap demo``; or a file ``NAME.mp4`` (``.npz``, ...) beside ``NAME_truth.npz`` (...).
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of recordings with truth, found no such folder")
+    entries = sorted(folder.glob("[!.]*"))
+    found = [one for path in (folder, *(p for p in entries if p.is_dir())) if (one := _of_folder(path))]
+    for path in (entry for entry in entries if entry.suffix.lower() not in LOG_SUFFIXES):
+        truths = [folder / f"{path.stem}_truth{suffix}" for suffix in TRUTH_SUFFIXES]
+        if (truth := next((t for t in truths if t.is_file()), None)) is not None:
+            found.append(Recording(path.stem, path, truth))
+    if not found:
+        raise InputError(
+            f"{folder}: expected folders with truth.npz (.c3d, .trc, .bvh) and a recording, or NAME.mp4 (.npz, ...)"
+            " beside NAME_truth.npz, found none; name the files so"
+        )
+    return found
+
+
+def _of_folder(folder: Path) -> Recording | None:
+    """Of a folder with a truth; None without."""
+    truth = next((t for suffix in TRUTH_SUFFIXES if (t := folder / f"truth{suffix}").is_file()), None)
+    if truth is None:
+        return None
+    named = [folder / name for name in _INPUTS if (folder / name).exists()]
+    results = ("truth", "motion", "report", "compare", "table")
+    others = [p for p in sorted(folder.glob("[!.]*")) if p.stem not in results and p.suffix.lower() not in LOG_SUFFIXES]
+    if not named and len(others) != 1:
+        there = ", ".join(path.name for path in others[:9]) or "none"
+        raise InputError(f"{folder}: expected one recording beside {truth.name}, found {there}; leave one there")
+    return Recording(folder.name, (named or others)[0], truth)
+
+
+def recordings_table(
+    recordings: Sequence[Recording],
+    methods: Iterable[str],
+    config: DrocapConfig,
+    models: Path | None = None,
+    progress: Progress = lambda _stage, _done: None,
+) -> list[RecordingRow]:
+    """Every method on every recording, whose 2D poses are estimated once; one that cannot be used is left out."""
+    rows: list[RecordingRow] = []
+    for done, recording in enumerate(recordings):
+        progress("recordings", done / len(recordings))
+        try:
+            rows += _measured(recording, tuple(methods), config, models)
+        except InputError as error:  # each takes seconds to minutes
+            logger.warning("%s: left out: %s", recording.name, error)
+    if not rows:
+        raise InputError("evaluate table: expected a recording that can be used, found none; see the lines above")
+    return rows
+
+
+def _measured(
+    recording: Recording, methods: tuple[str, ...], config: DrocapConfig, models: Path | None
+) -> list[RecordingRow]:
+    truth = load_truth(recording.truth)
+    first, tracks = reconstruct_input(recording.source, method=methods[0], config=config, models=models)
+    initializer, adjuster = config.initializer, config.bundle_adjuster
+    others = (reconstruct(tracks, method=m, initializer=initializer, adjuster=adjuster) for m in methods[1:])
+    return [
+        RecordingRow(recording.name, method, compare(motion, *truth))
+        for method, motion in zip(methods, (first, *others), strict=True)
+    ]
+
+
+_Row = TypeVar("_Row", bound=RecordingRow)
 _LABELS = {
     "ba": "default (`ba`)",
     "paper": "paper: bundle adjustment",
@@ -31,8 +130,6 @@ _LABELS = {
     "initial": "paper: single-view initialization",
     "mf-nnm": "MF+NNM",
 }
-#: Speed of the tables per joint group and per sequence, deg/s: that of the demo's orbit.
-_SPEED_DEG_S = 25.0
 #: Column -> error in the world, its factor and its form.
 _WORLD = {
     "PA-MPJPE mm": ("pa_mm", 1, ".1f"),
@@ -92,9 +189,10 @@ def errors_record(e: MotionErrors | WorldErrors) -> dict[str, object]:
     return record
 
 
-def study_record(row: RotationRow | WorldRow | RecordingRow) -> dict[str, object]:
-    """One result of a study as columns for :func:`save_csv`."""
-    return {key: value for key, value in vars(row).items() if key != "errors"} | errors_record(row.errors)
+def study_record(row: object) -> dict[str, object]:
+    """One row of a table or a study as columns for :func:`save_csv`."""
+    record = dict(vars(row))
+    return record | errors_record(record.pop("errors"))
 
 
 def comparison_markdown(name: str, e: MotionErrors) -> str:
@@ -110,48 +208,18 @@ def comparison_markdown(name: str, e: MotionErrors) -> str:
     return "\n".join(tables) + "\n"
 
 
-def rotation_markdown(rows: list[RotationRow]) -> str:
-    """Error over speed, error per joint group, and error per sequence, as Markdown."""
-    speeds = sorted({r.speed_deg_s for r in rows})
-    speed = _SPEED_DEG_S if _SPEED_DEG_S in speeds else speeds[-1]
-    by_method = _by_method(rows)
-    by_speed = [_speed_cells(method, of, speeds) for method, of in by_method.items()]
-    at_speed = _by_method([r for r in rows if r.speed_deg_s == speed])
-    per_sequence = [_sequence_cells(same) for same in zip(*at_speed.values(), strict=True)]
-    kind = "noisy" if rows[0].noisy else "clean"
-    lines = [
-        f"Reconstruction error in mm, mean over {len(per_sequence)} sequences, {kind} 2D, by orbit speed in deg/s.",
-        "",
-        *markdown_table(["method", *(f"{s:g}" for s in speeds), "mirrored"], by_speed),
-        *("", f"Per joint group at {speed:g} deg/s, mm.", ""),
-        *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(_group_cells, at_speed.items()))),
-        *("", f"Per sequence at {speed:g} deg/s, mm.", ""),
-        *markdown_table(["sequence", *(label(m) for m in by_method)], per_sequence),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _sequence_cells(rows: tuple[RotationRow, ...]) -> list[str]:
-    """The sequence and its error by every method."""
-    return [rows[0].sequence, *(f"{r.errors.error_mm:.1f}" for r in rows)]
-
-
-def _speed_cells(method: str, rows: list[RotationRow], speeds: list[float]) -> list[str]:
-    return [label(method), *(f"{_mean_mm(rows, s):.1f}" for s in speeds), str(sum(r.errors.mirrored for r in rows))]
-
-
 def recordings_markdown(rows: list[RecordingRow]) -> str:
     """The paper's tables: mean error by method and recording, and per joint group; errors in the world where known."""
-    by_method, names = _by_method(rows), list(dict.fromkeys(row.sequence for row in rows))
-    means = {m: np.mean([row.errors.error_mm for row in of]) for m, of in by_method.items()}
+    of_method, names = by_method(rows), list(dict.fromkeys(row.sequence for row in rows))
+    means = {m: np.mean([row.errors.error_mm for row in of]) for m, of in of_method.items()}
     cells = [
-        [label(m), *(f"{row.errors.error_mm:.1f}" for row in of), f"{means[m]:.1f}"] for m, of in by_method.items()
+        [label(m), *(f"{row.errors.error_mm:.1f}" for row in of), f"{means[m]:.1f}"] for m, of in of_method.items()
     ]
     lines = [
         *("Reconstruction error in mm.", ""),
         *markdown_table(["method", *names, "mean"], cells),
         *("", "Per joint group, mm.", ""),
-        *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(_group_cells, by_method.items()))),
+        *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(group_cells, of_method.items()))),
     ]
     placed = [(f"{r.sequence}, {label(r.method)}", r.errors.world) for r in rows if r.errors.world is not None]
     if placed:
@@ -160,15 +228,12 @@ def recordings_markdown(rows: list[RecordingRow]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _by_method(rows: list[_Row]) -> dict[str, list[_Row]]:
+def by_method(rows: list[_Row]) -> dict[str, list[_Row]]:
+    """Rows of each method, in the order of their first ones."""
     return {method: [r for r in rows if r.method == method] for method in dict.fromkeys(r.method for r in rows)}
 
 
-def _mean_mm(rows: list[RotationRow], speed: float) -> float:
-    return float(np.mean([r.errors.error_mm for r in rows if r.speed_deg_s == speed]))
-
-
-def _group_cells(method: str, rows: list[_Row]) -> list[str]:
+def group_cells(method: str, rows: Sequence[RecordingRow]) -> list[str]:
     """The method and its mean error per joint group and of the toes, "-" where no row knows it."""
     errors = [r.errors for r in rows]
     groups: list[np.floating] = [np.mean([e.per_group_mm[group] for e in errors]) for group in JOINT_GROUPS]
@@ -176,43 +241,16 @@ def _group_cells(method: str, rows: list[_Row]) -> list[str]:
     return [label(method), *(f"{g:.1f}" for g in groups), f"{np.mean(toes):.1f}" if toes else "-"]
 
 
-def world_markdown(rows: list[WorldRow], case: WorldCase) -> str:
-    """Errors of every sequence and their means as Markdown."""
-    cells = [[row.sequence, *world_cells(row.errors)] for row in rows]
-    seconds = sum(row.seconds for row in rows) / sum(row.frames for row in rows) * 300
-    measured, placed = sum(row.metric for row in rows), sum(row.frame == "world" for row in rows)
-    lines = [
-        f"Motion in the world, {len(rows)} sequences, {case.words()}.",
-        "",
-        *markdown_table(["sequence", *WORLD_HEAD], [*cells, ["mean", *world_cells(world_means(rows))]]),
-        "",
-        f"In the world {placed}, with measured scale {measured} of {len(rows)}; {seconds:.2f} s per 300 frames.",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def save_curves(path: Path, rows: list[RotationRow]) -> None:
-    """Error over orbit speed, one curve per method, as PNG."""
-    figure, axes = _plot(6.4, 4.2)
-    for method, found in _by_method(rows).items():
-        speeds = sorted({r.speed_deg_s for r in found})
-        axes.plot(speeds, [_mean_mm(found, s) for s in speeds], marker="o", label=label(method))
-    axes.set(xlabel="orbit speed, deg/s", ylabel="reconstruction error, mm")
-    axes.set_title(f"{len({r.sequence for r in rows})} sequences, {'noisy' if rows[0].noisy else 'clean'} 2D")
-    axes.set_ylim(bottom=0)
-    axes.legend()
-    figure.savefig(path, dpi=120)
-
-
 def save_group_bars(path: Path, e: MotionErrors) -> None:
     """Error per joint group as PNG."""
-    figure, axes = _plot(6.4, 3.6)
+    figure, axes = plot(6.4, 3.6)
     axes.bar(list(JOINT_GROUPS), [e.per_group_mm[g] for g in JOINT_GROUPS])
     axes.set_ylabel("error, mm")
     figure.savefig(path, dpi=120)
 
 
-def _plot(width: float, height: float) -> tuple[Figure, Axes]:
+def plot(width: float, height: float) -> tuple[Figure, Axes]:
+    """An empty figure of a size in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import logging
 import re
+import warnings
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.evaluation.c3d_file import read_c3d
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.skeleton import BODY_17, LIMB_JOINTS, in_body_order, indices
-from drocap_ros.tracks import MAX_FRAMES
+from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, JointSet, in_body_order, indices
+from drocap_ros.tracks import MAX_FRAMES, read_npz
 
 logger = logging.getLogger(__name__)
 
@@ -149,12 +150,37 @@ def _even_times(count: int, rate_hz: float) -> np.ndarray:
     return np.arange(count) / rate_hz
 
 
-def _of_c3d(path: Path) -> _Points:
-    """Without a statement millimetres, z up."""
-    found = read_c3d(path)
-    unit = found.unit if found.unit in _UNITS else "mm"
-    up = found.vertical if found.vertical.lstrip("-") in _TO_Z_UP else "Z"
-    return _Points(found.names, found.positions, _even_times(len(found.positions), found.rate_hz), unit, up)
+def _read_c3d(path: Path) -> _Points:
+    """By the package c3d (https://www.c3d.org/HTML); without a statement millimetres, z up."""
+    import c3d
+
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the library, about parameters that it misses
+        try:
+            reader = c3d.Reader(file)
+            reader.get_analog_transform = lambda: (1.0, 0.0)  # nobody asks, and of some files it cannot be read
+            texts = {
+                name: [str(text).strip() for text in np.atleast_1d(found.string_array)]
+                for name in ("UNITS", "Y_SCREEN", "LABELS", *(f"LABELS{i}" for i in range(2, 10)))
+                if (found := reader.get(f"POINT:{name}"))
+            }
+            frames = [points[:, :4] for _, points, _ in islice(reader.read_frames(), MAX_FRAMES)]
+        except Exception as error:  # noqa: BLE001  # the library raises whatever the damage leads to
+            raise InputError(f"expected a C3D file that can be read; {first_line(error) or 'it is damaged'}") from None
+    names = [name for key, labels in texts.items() if key.startswith("LABELS") for name in labels]
+    table = np.array(frames, dtype=np.float64).reshape(len(frames), -1, 4)[:, : len(names)]
+    if not table.size:
+        raise InputError("expected named points in the C3D file, found none; export it again")
+    table[table[..., 3] < 0] = np.nan
+    unit, up = ("".join(texts.get(name, [])[:1]) for name in ("UNITS", "Y_SCREEN"))
+    unit, up = unit.lower(), up.upper().lstrip("+")
+    return _Points(
+        names[: table.shape[1]],
+        table[..., :3],
+        _even_times(len(table), float(reader.point_rate)),
+        unit if unit in _UNITS else "mm",
+        up if up.lstrip("-") in _TO_Z_UP else "Z",
+    )
 
 
 def _read_trc(path: Path) -> _Points:
@@ -261,7 +287,48 @@ def _kinematics(bones: list[_Bone], values: np.ndarray) -> np.ndarray:
 
 
 _READERS: tuple[tuple[re.Pattern[bytes], Callable[[Path], _Points]], ...] = (
-    (re.compile(rb".\x50", re.DOTALL), _of_c3d),
+    (re.compile(rb".\x50", re.DOTALL), _read_c3d),
     (re.compile(rb"\s*HIERARCHY"), _read_bvh),
     (re.compile(rb"PathFileType"), _read_trc),
 )
+
+
+def load_mocap(
+    path: Path, required: tuple[str, ...] = BODY_15.joints, joints: JointSet = BODY_15
+) -> tuple[np.ndarray, float]:
+    """Joints (T, P, 3) mm, world z up, and frames per second of one MoCap ``.npz``.
+
+    Toes are further joints of ``X``, or the array ``toes`` (T, 2, 3) with their names in ``toe_joints``.  Where
+    ``toe_kind`` is "ball", the array holds the balls of the feet, which are no joints of the body.
+
+    Parameters
+    ----------
+    required : joints that the file must hold; others that it lacks are NaN
+    joints : ``BODY_15`` or ``BODY_17``, those of the result
+    """
+    a = read_npz(path, ("X", "fps", "joints"))
+    try:
+        x, names = _named_joints(a)
+        fps = a["fps"]
+        if fps.size != 1 or fps.dtype.kind not in "iuf" or not 1.0 <= float(fps.item()) <= 1000.0:
+            raise InputError(f"fps: expected a number from 1 to 1000, got {fps}")
+        body = in_body_order(x, names, required)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return body[:, : len(joints)], float(fps.item())
+
+
+def _named_joints(a: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str]]:
+    """Joints (T, P, 3) mm of a file with its toes, and their names (P)."""
+    x, names = a["X"], [str(j) for j in a["joints"]]
+    if x.ndim != 3 or x.shape[1:] != (a["joints"].size, 3) or len(x) == 0:
+        raise InputError(f"X: expected (T, {a['joints'].size}, 3), got {x.shape}")
+    if "toes" in a and str(a.get("toe_kind", "tip")) == "tip":
+        toes = [str(j) for j in np.atleast_1d(a.get("toe_joints", ("rtoe", "ltoe")))]
+        if a["toes"].shape != (len(x), len(toes), 3):
+            raise InputError(f"toes: expected {(len(x), len(toes), 3)}, got {a['toes'].shape}")
+        x, names = np.concatenate([x, a["toes"]], axis=1), [*names, *toes]
+    x = x.astype(np.float64)
+    if not np.isfinite(x).all():
+        raise InputError("X, toes: expected finite millimetres, got NaN or infinity; fill the gaps in")
+    return x, names

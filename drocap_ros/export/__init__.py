@@ -46,21 +46,18 @@ def export(
     form : one of :data:`FORMATS`; None: the ending of ``path``
     names : joint names of BVH and glTF, one of :data:`drocap_ros.export.rig.NAMES`; None: "h36m"
     rest : rest pose of BVH and glTF, one of :data:`drocap_ros.export.rig.RESTS`; None: "t"
-    smooth_hz : cut-off of :func:`drocap_ros.export.cleaning.smooth`; None: no filter
-    lock_feet : :func:`drocap_ros.export.cleaning.lock_feet`, after the filter
+    smooth_hz : cut-off of :func:`drocap_ros.export.take.smooth`; None: no filter
+    lock_feet : :func:`drocap_ros.export.take.lock_feet`, after the filter
 
     Returns
     -------
     Notes on changes, as sentences: frames without the person, resampling, interpolation, cleaning, constant bones,
     floor, unknown vertical.
     """
-    from drocap_ros.export import cleaning
-    from drocap_ros.export.angles import write_csv_angles
-    from drocap_ros.export.bvh import write_bvh
-    from drocap_ros.export.glb import write_glb
-    from drocap_ros.export.measured import write_c3d, write_csv, write_trc
-    from drocap_ros.export.mot import write_mot
-    from drocap_ros.export.take import take_of
+    from drocap_ros.export import take as preparation
+    from drocap_ros.export.animation import write_bvh, write_glb
+    from drocap_ros.export.measured import write_c3d, write_csv, write_csv_angles, write_trc
+    from drocap_ros.export.opensim import write_mot
     from drocap_ros.motion import Motion, load_motion
 
     writers: dict[str, Callable[..., tuple[str, ...]]] = {
@@ -79,11 +76,11 @@ def export(
     if chosen and form not in RIGGED:
         raise InputError(f"{', '.join(chosen)}: expected with format {' or '.join(RIGGED)}, got {form}; leave it out")
     whole = motion if isinstance(motion, Motion) else load_motion(motion)
-    take = take_of(whole, measured=form in MEASURED)
+    take = preparation.take_of(whole, measured=form in MEASURED)
     if smooth_hz is not None:
-        take = cleaning.smooth(take, smooth_hz)
+        take = preparation.smooth(take, smooth_hz)
     if lock_feet:
-        take = cleaning.lock_feet(take)
+        take = preparation.lock_feet(take)
     return writers[form](Path(path), take, **chosen)
 
 

@@ -17,11 +17,12 @@ from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.balance import balanced
 from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
 from drocap_ros.reconstruction.camera.fusion import fuse_telemetry, with_causes
+from drocap_ros.reconstruction.camera.kinds import cut_times
 from drocap_ros.reconstruction.camera.picture_world import picture_camera, with_camera
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.engine import blas_threads
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
-from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.heels import with_heels
 from drocap_ros.reconstruction.in_metres import Body, Settings, as_seen, by_place, in_metres
 from drocap_ros.reconstruction.methods import METHODS
@@ -70,7 +71,7 @@ def reconstruct(
 
     Parameters
     ----------
-    tracks : joints by the names of BODY_17 or of a set in :mod:`drocap_ros.joint_maps`, COCO for one; the model
+    tracks : joints by the names of BODY_17 or of a set in :mod:`drocap_ros.skeleton`, COCO for one; the model
         estimates missing ones, others are ignored
     method : a name in :data:`~drocap_ros.reconstruction.methods.METHODS`
     progress : called with a stage and its fraction done
@@ -80,8 +81,12 @@ def reconstruct(
     Motion
         In frame "world" when the tracks hold the camera's rotation, else in frame "camera"; with the joints of the
         method, ``BODY_17`` or ``BODY_15``, and by the default method with the heels where the tracks hold them.
+        A clip without telemetry whose fixed points show cuts has no camera: frame "camera", ``meta["cuts_s"]``.
     """
-    return solve(tracks, method=method, initializer=initializer, adjuster=adjuster, progress=progress).motion
+    cuts_s = cut_times(tracks)
+    clip = dataclasses.replace(tracks, background=None) if cuts_s else tracks
+    motion = solve(clip, method=method, initializer=initializer, adjuster=adjuster, progress=progress).motion
+    return dataclasses.replace(motion, meta={**motion.meta, "cuts_s": cuts_s}) if cuts_s else motion
 
 
 def solve(

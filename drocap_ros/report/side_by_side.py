@@ -10,8 +10,7 @@ import numpy as np
 
 from drocap_ros.clip import Progress
 from drocap_ros.motion import Motion, upright_joints
-from drocap_ros.report.crop import Box, FollowingBox
-from drocap_ros.report.motion_images import each_image
+from drocap_ros.report.motion_images import Box, FollowingBox, each_image
 from drocap_ros.report.statistics import Statistics, motion_statistics, smooth
 from drocap_ros.report.video_file import VideoFile
 from drocap_ros.skeleton import side_of
@@ -47,13 +46,13 @@ def save_side_by_side(path: Path, motion: Motion, video: Path, progress: Progres
     Raises
     ------
     InputError
-        When there is no FFmpeg, the motion holds no pose, or the video cannot be used.
+        When the motion holds no pose, or the video cannot be used.
     DrocapError
         When the file cannot be written.
     """
     pictures = _pictures(motion, video, progress)
     first, rate_hz = next(pictures)
-    with VideoFile(path, (first.shape[1], first.shape[0]), rate_hz, require_h264=True) as out:
+    with VideoFile(path, (first.shape[1], first.shape[0]), rate_hz) as out:
         out.write(first)
         for picture, _ in pictures:
             out.write(picture)

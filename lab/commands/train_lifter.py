@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from drocap_ros.cli.atomic_output import check_output_file, output_file
     from drocap_ros.errors import InputError
-    from drocap_ros.mocap import mocap_files
+    from lab.studies.protocol import mocap_files
     from lab.training.lifter import LifterTraining, describe_training, export_onnx, train
     from lab.training.mocap_bank import load_bank
     from lab.training.torch_extra import onnx_package

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.evaluation.protocol import FPS, protocol_sequences, reported
 from drocap_ros.evaluation.tables import markdown_table
-from drocap_ros.evaluation.world_protocol import SHORTEST_S, TelemetryErrors, WorldCase, world_view
 from drocap_ros.reconstruction.reconstruct import reconstruct
+from lab.studies.protocol import FPS, protocol_sequences, reported
+from lab.studies.world_protocol import SHORTEST_S, TelemetryErrors, WorldCase, world_view
 
 LATE_S = 0.08
 #: Longest time of a run, and bounds within which an error counts as found.

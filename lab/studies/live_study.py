@@ -12,10 +12,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.protocol import OrbitView, orbit_view, protocol_sequences, reported
-from drocap_ros.evaluation.world_protocol import WorldView
 from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.mocap import Sequence
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
@@ -23,6 +20,8 @@ from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_pos
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_15, BODY_17
+from lab.studies.protocol import OrbitView, Sequence, orbit_view, protocol_sequences, reported
+from lab.studies.world_protocol import WorldView
 
 #: Age at which the error of a refined pose counts.
 REFINED_AFTER_S = 2.0

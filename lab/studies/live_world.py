@@ -11,18 +11,17 @@ import numpy as np
 
 from drocap_ros.background import Background
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
-from drocap_ros.evaluation.protocol import FPS, reported
 from drocap_ros.evaluation.tables import WORLD_HEAD, markdown_table, world_cells
-from drocap_ros.evaluation.world_protocol import LONGEST_S, NONE, WorldCase, WorldView, world_sequences, world_view
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.live.latest_place import LatestPlace
-from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
+from drocap_ros.reconstruction.live.latest_pose import LatestPlace, LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from lab.studies.live_study import REFINED_AFTER_S, observations
+from lab.studies.protocol import FPS, reported
+from lab.studies.world_protocol import LONGEST_S, NONE, WorldCase, WorldView, world_sequences, world_view
 
 
 class LiveWorldRow(NamedTuple):

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.protocol import FPS, orbit_rotations
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
+from lab.studies.protocol import FPS, Sequence, orbit_rotations
 
 #: Width and height px.
 IMAGE_SIZE = (1280, 720)

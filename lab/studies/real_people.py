@@ -10,7 +10,7 @@ import numpy as np
 from drocap_ros.api import reconstruct
 from drocap_ros.config import DrocapConfig
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.report.flexion import flexion
+from drocap_ros.report.movement import flexion
 from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, indices
 from drocap_ros.tracks import read_npz
 

@@ -8,12 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.evaluation.compare import world_errors
-from drocap_ros.evaluation.protocol import FPS, Progress, reported
-from drocap_ros.evaluation.world_protocol import WorldCase, world_view
-from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.reconstruct import solve
 from drocap_ros.reconstruction.together.joined import join_views
 from drocap_ros.tracks import Tracks
+from lab.studies.protocol import FPS, Progress, Sequence, reported
+from lab.studies.world_protocol import WorldCase, world_view
 
 #: Images that the second camera starts later: 1.375 s.
 LATER = 33

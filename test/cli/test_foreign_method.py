@@ -36,9 +36,9 @@ def package(root, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def drocap(root, package):
-    def run(*words):
+    def run(*words, module="drocap_ros.cli"):
         path = os.pathsep.join([str(package), str(root), os.environ.get("PYTHONPATH", "")])
-        command = [sys.executable, "-m", "drocap_ros.cli", *map(str, words)]
+        command = [sys.executable, "-m", module, *map(str, words)]
         env = {**os.environ, "PYTHONPATH": path}
         return subprocess.run(command, capture_output=True, text=True, timeout=250, env=env)
 
@@ -73,10 +73,10 @@ def test_batch_runs_it(drocap, tracks, tmp_path):
     assert motion.meta["method"] == "flat"
 
 
-def test_evaluate_has_its_row(drocap, tmp_path):
+def test_a_study_has_its_row(drocap, tmp_path):
     mm = (1000 * make_walk(130).shape).astype(np.float32)
     np.savez(tmp_path / "walk.npz", X=mm, fps=24.0, joints=np.array(BODY_15.joints))
-    done = drocap("evaluate", "rotation", tmp_path, "--methods", "flat", "initial", "--speeds", "25", "--quiet")
+    done = drocap("rotation", tmp_path, "--methods", "flat", "initial", "--speeds", "25", "--quiet", module="lab")
     assert done.returncode == 0, done.stderr
     error_mm = {cells[1].strip(): float(cells[2]) for line in done.stdout.splitlines()
                 if len(cells := line.split("|")) == 5 and re.fullmatch(r" \d+\.\d ", cells[2])}  # fmt: skip

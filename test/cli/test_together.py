@@ -10,12 +10,12 @@ import pytest
 
 from drocap_ros.cli import main
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.world_scene import PinholePath, followed_points
 from drocap_ros.motion import load_motion
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks, save_tracks
+from lab.studies.world_scene import PinholePath, followed_points
 
 SIZE, FPS, FRAMES = (1280, 720), 30.0, 240
 #: s by which the second recording starts later; its clock is another one.

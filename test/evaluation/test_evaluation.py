@@ -11,9 +11,6 @@ import pytest
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.compare import compare, load_truth
-from drocap_ros.evaluation.protocol import protocol_sequences
-from drocap_ros.evaluation.rotation import measure, rotation_study
-from drocap_ros.evaluation.tables import rotation_markdown
 from drocap_ros.motion import Motion, save_motion
 from drocap_ros.skeleton import BODY_15, BODY_17
 
@@ -151,41 +148,3 @@ def test_compare_command_writes_files_and_refuses_missing_ones_with_status_2(tmp
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "no such file" in said
-
-
-def test_rotation_command_writes_its_tables(tmp_path, capsys):
-    save_mocap(tmp_path / "a.npz", stick(130))
-    save_mocap(tmp_path / "short.npz", stick(40))
-    out = tmp_path / "out"
-    words = ["evaluate", "rotation", str(tmp_path), "--speeds", "0", "25", "--methods", "ba", "initial", "--quiet"]
-    assert main([*words, "--out", str(out)]) == 0
-    text = capsys.readouterr().out
-    assert "mean over 1 sequences" in text
-    assert text == (out / "rotation.md").read_text(encoding="utf-8")
-    with (out / "rotation.csv").open(encoding="utf-8") as file:
-        lines = list(csv.DictReader(file))
-    assert [(r["method"], r["speed_deg_s"]) for r in lines] == [
-        ("ba", "0.0000"), ("ba", "25.0000"), ("initial", "0.0000"), ("initial", "25.0000"),
-    ]  # fmt: skip
-    assert (out / "rotation.png").read_bytes().startswith(b"\x89PNG")
-    assert main([*words[:2], str(tmp_path / "absent")]) == 2
-    assert main([*words, "--limit", "0"]) == 2
-    assert main(["evaluate", "rotation", str(tmp_path), "--speeds", "9999"]) == 2
-
-
-def test_study_rows_are_independent_of_the_number_of_processes(tmp_path):
-    save_mocap(tmp_path / "a.npz", stick(125))
-    one, two = (
-        rotation_study(protocol_sequences(tmp_path), speeds_deg_s=[25.0], methods=["initial"], processes=count)
-        for count in (1, 2)
-    )
-    assert [r.errors.per_group_mm for r in one] == [r.errors.per_group_mm for r in two]
-    assert [r.limb_spread for r in one] == [r.limb_spread for r in two]
-    assert "single-view initialization" in rotation_markdown(one)
-
-
-def test_default_method_is_accurate_and_unmirrored_on_unseen_people(shared):
-    for sequence in protocol_sequences(shared / "mocap" / "dev", limit=2):
-        row = measure(sequence, "ba", 25.0, noisy=True)
-        assert not row.errors.mirrored
-        assert row.errors.error_mm < 40.0

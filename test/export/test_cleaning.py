@@ -9,8 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.export import export
-from drocap_ros.export.cleaning import lock_feet, smooth
-from drocap_ros.export.take import take_of
+from drocap_ros.export.take import lock_feet, smooth, take_of
 from drocap_ros.motion import save_motion
 from drocap_ros.skeleton import BODY_15
 

@@ -8,7 +8,7 @@ import pytest
 from walking import make_walk
 
 from drocap_ros.cli import main
-from drocap_ros.export.angles import joint_angles
+from drocap_ros.export.measured import joint_angles
 from drocap_ros.export.rigid_body import fit_rigid_body
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import save_motion

@@ -9,7 +9,7 @@ import pytest
 from walking import make_walk
 
 from drocap_ros.cli import main
-from drocap_ros.export.opensim_model import model_xml
+from drocap_ros.export.opensim import model_xml
 from drocap_ros.export.rigid_body import fit_rigid_body
 from drocap_ros.motion import save_motion
 from drocap_ros.skeleton import BODY_15

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.bvh import write_bvh
+from drocap_ros.export.animation import write_bvh
 from drocap_ros.export.rig import rig_of
 from drocap_ros.export.rigid_body import fit_rigid_body
 from drocap_ros.export.take import take_of, y_up

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.evaluation.protocol import orbit_rotations
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
+from lab.studies.protocol import orbit_rotations
 
 PX_PER_M = 400.0
 CENTRE = np.array([640.0, 512.0])

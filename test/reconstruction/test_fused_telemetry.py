@@ -9,13 +9,13 @@ import pytest
 
 from drocap_ros.background import Background
 from drocap_ros.evaluation.compare import world_errors
-from drocap_ros.evaluation.world_protocol import FPS, WorldCase, WorldView, world_view
-from drocap_ros.mocap import Sequence
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
+from lab.studies.protocol import Sequence
+from lab.studies.world_protocol import FPS, WorldCase, WorldView, world_view
 
 FRAMES = 192
 

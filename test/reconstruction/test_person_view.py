@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drocap_ros.evaluation.protocol import protocol_sequences
 from drocap_ros.geometry.alignment import similarity
 from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.body_input import body_keypoints
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses, Report
@@ -20,6 +18,7 @@ from drocap_ros.reconstruction.person_view import PersonView, person_view, true_
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.tracks import Tracks, load_tracks, save_tracks
 from lab.studies.near_camera import NearCamera, error_mm, known, without_camera
+from lab.studies.protocol import Sequence, protocol_sequences
 
 
 def people() -> Sequence:

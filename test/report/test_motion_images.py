@@ -12,7 +12,7 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import open_images
 from drocap_ros.report import motion_images
 from drocap_ros.report.motion_images import ImagesBeside, has_images, read_motion_images
-from drocap_ros.report.page_data import page_data
+from drocap_ros.report.page import page_data
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.render.renderer import Renderer

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.report.flexion import flexion
-from drocap_ros.report.page import render_report
-from drocap_ros.report.page_data import MAX_POSES, script_json
+from drocap_ros.report.movement import flexion
+from drocap_ros.report.page import MAX_POSES, render_report, script_json
 from drocap_ros.skeleton import BODY_15
 
 VOID = {"meta", "input", "br", "img", "link"}

@@ -12,7 +12,7 @@ import pytest
 
 from drocap_ros.cli import main
 from drocap_ros.cli.demo.verdict import settled_orbit
-from drocap_ros.cli.signals import interruptible
+from drocap_ros.cli.running import interruptible
 from drocap_ros.flight.orbit.states import State
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drocap_ros.cli.options import Subparsers, add_command, add_quiet_option, add_seed_option
-from drocap_ros.cli.progress import progress_bars
-from drocap_ros.cli.signals import interruptible
+from drocap_ros.cli.running import interruptible, progress_bars
 
 if TYPE_CHECKING:
     from drocap_ros.cli.demo.operator import Operator

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from drocap_ros.cli.graph.common import add_start_options, chosen_domain, import_bringup
 from drocap_ros.cli.graph.top import dashboard_of
 from drocap_ros.cli.options import Subparsers, add_command, add_config_option, add_models_option
-from drocap_ros.cli.signals import stop_signals
+from drocap_ros.cli.running import stop_signals
 from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
 

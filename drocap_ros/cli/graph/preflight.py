@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from drocap_ros.cli.atomic_output import check_output_file, output_file
 from drocap_ros.cli.graph.common import PIPE_WIDTH, add_place_options, chosen_domain
 from drocap_ros.cli.options import Subparsers, add_command, add_config_option, add_models_option
-from drocap_ros.cli.progress import progress_bars
+from drocap_ros.cli.running import progress_bars
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:

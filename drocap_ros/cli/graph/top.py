@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from drocap_ros.cli.graph.common import PIPE_WIDTH, add_place_options, chosen_domain, import_bringup
 from drocap_ros.cli.options import Subparsers, add_command
-from drocap_ros.cli.signals import stop_signals
+from drocap_ros.cli.running import stop_signals
 from drocap_ros.ros.diagnostics import Key, number, values_of, words
 
 if TYPE_CHECKING:

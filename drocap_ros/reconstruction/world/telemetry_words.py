@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from drocap_ros.reconstruction.world.findings import MEASURED
+from drocap_ros.reconstruction.world.world_model import MEASURED
 
 #: Standard deviations from zero at which a correction is stated: 95 of 100 errors of nothing are smaller.
 _CLEAR = 2.0
@@ -24,10 +24,11 @@ def telemetry_words(meta: Mapping[str, Any]) -> str:
     rejected = meta.get("telemetry_rejected")
     if isinstance(rejected, str):
         return f"Telemetry not used: {rejected}."
-    camera, windows, shots = meta.get("camera"), meta.get("calibration"), meta.get("shots")
+    camera, windows = meta.get("camera"), meta.get("calibration")
     try:
-        if isinstance(shots, list):
-            return _shots(shots, meta["cuts_s"])
+        if cuts_s := meta.get("cuts_s"):
+            cuts = ", ".join(f"{cut:.1f}" for cut in cuts_s)
+            return f"Cut at {cuts} s: no camera belongs to the whole clip; give one scene (--start, --end)."
         if isinstance(camera, Mapping):
             return _camera(camera)
         if not isinstance(windows, list) or not windows or not isinstance(windows[0], Mapping):
@@ -35,17 +36,6 @@ def telemetry_words(meta: Mapping[str, Any]) -> str:
         return _calibrations(windows, meta.get("assumed_height_m"))
     except (KeyError, TypeError, ValueError, IndexError, ZeroDivisionError):
         return ""  # written by hand or by another version
-
-
-def _shots(shots: list[Mapping[str, Any]], cuts_s: list[float]) -> str:
-    """The cuts of a clip, and the camera of each shot between them."""
-    told = f"Cut at {', '.join(f'{cut:.1f}' for cut in cuts_s)} s"
-    if any("up_std_deg" not in shot["camera"] for shot in shots):
-        told += "; a shot without a camera leaves all in the camera's frame: give one scene (--start, --end)"
-    elif len(shots) > 1:
-        told += "; nothing relates the shots: each goes on where the person stood"
-    cameras = [f"{shot['span_s'][0]:.1f} to {shot['span_s'][1]:.1f} s: {_camera(shot['camera'])}" for shot in shots]
-    return " ".join([f"{told}.", *cameras])
 
 
 def _camera(camera: Mapping[str, Any]) -> str:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import orbit_view
-from drocap_ros.evaluation.world_protocol import NONE, WorldCase
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15, BODY_17
 from lab.studies.live_study import live_study, simulate_live, standardized_error
 from lab.studies.live_study_table import live_markdown
 from lab.studies.live_world import live_world_markdown, live_world_study
+from lab.studies.protocol import orbit_view
+from lab.studies.world_protocol import NONE, WorldCase
 
 
 def walk_mm(seconds: float) -> np.ndarray:

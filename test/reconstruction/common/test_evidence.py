@@ -11,14 +11,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.protocol import protocol_sequences
-from drocap_ros.mocap import Sequence
-from drocap_ros.reconstruction.common.evidence import Evidence
+from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.evidence import body_places, with_evidence
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import load_tracks, save_tracks
 from lab.studies.near_camera import NearCamera, known
+from lab.studies.protocol import Sequence, protocol_sequences
 
 NAMES = {
     "SMPL": "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot"

@@ -9,12 +9,12 @@ import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.protocol import PX_PER_MM, orbit_rotations, orbit_view, protocol_sequences
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.lifted.lifter import SHIPPED, Lifter
 from drocap_ros.reconstruction.lifted.network import LifterInput
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
+from lab.studies.protocol import PX_PER_MM, orbit_rotations, orbit_view, protocol_sequences
 
 
 @pytest.fixture(scope="module")

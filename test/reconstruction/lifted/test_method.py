@@ -10,13 +10,13 @@ from scipy.signal import lfilter
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.protocol import PX_PER_MM, orbit_rotations, orbit_view, protocol_sequences
 from drocap_ros.geometry.bones import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted.method import solve_even_window
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
+from lab.studies.protocol import PX_PER_MM, orbit_rotations, orbit_view, protocol_sequences
 
 
 def sway(frames: int) -> np.ndarray:

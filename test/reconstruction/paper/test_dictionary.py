@@ -10,21 +10,17 @@ import pytest
 from walking import make_walk
 
 from drocap_ros.errors import InputError
+from drocap_ros.evaluation.truth_files import load_mocap
 from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.mocap import load_mocap
 from drocap_ros.reconstruction.paper.dictionary import (
     Dictionary,
-    Learning,
-    learn,
     load_dictionary,
-    mirror_poses,
     normalize_poses,
-    quality,
-    save_dictionary,
     soft_threshold,
     sparse_code,
 )
 from drocap_ros.skeleton import BODY_15
+from lab.training.dictionary import Learning, learn, mirror_poses, quality, save_dictionary
 
 
 def test_shipped_dictionary_names_its_origin(dictionary: Dictionary) -> None:

@@ -10,7 +10,6 @@ from angles import angle_between
 from walking import make_walk
 
 from drocap_ros.evaluation.metrics import is_mirrored, pa_mpjpe
-from drocap_ros.evaluation.protocol import orbit_rotations
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
 from drocap_ros.reconstruction.paper.mf_nnm import (
@@ -20,6 +19,7 @@ from drocap_ros.reconstruction.paper.mf_nnm import (
     rotations_by_factorization,
 )
 from drocap_ros.reconstruction.paper.reprojection import information_from
+from lab.studies.protocol import orbit_rotations
 
 FRAMES = 150
 

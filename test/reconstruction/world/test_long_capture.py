@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 
-from drocap_ros.evaluation.world_protocol import FPS, world_view
-from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
+from lab.studies.protocol import Sequence
+from lab.studies.world_protocol import FPS, world_view
 
 
 def test_windows_of_a_long_capture_join_without_a_step() -> None:

@@ -235,6 +235,6 @@ def test_info_shows_model_rates_and_what_is_missing(video, tmp_path, capsys):
     (tmp_path / "v.mp4").write_bytes(video)
     assert main(["info", str(tmp_path / "v.mp4")]) == 0
     assert capsys.readouterr().out.endswith("telemetry: none in the file\n")
-    (tmp_path / "v.mp4").write_bytes(video.replace(b"vide", b"\x1b[2J"))
+    (tmp_path / "v.mp4").write_bytes(video.replace(b"mp4v", b"\x1b[2J"))
     assert main(["info", str(tmp_path / "v.mp4")]) == 0
-    assert "?[2J track: MPEG-4 (mp4v)" in capsys.readouterr().out
+    assert "?[2J" in capsys.readouterr().out
