@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drocap_ros.flight.vehicle_filter import VehicleFilter
+from drocap_ros.flight.vehicle import VehicleFilter
 
 
 def filtered(times, positions, velocities, sd_m_s=0.1):

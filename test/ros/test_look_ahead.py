@@ -12,7 +12,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.ros.look_ahead import LookAhead
+from drocap_ros.ros.own_process import LookAhead
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix
 from drocap_ros.simulation.render.renderer import Renderer
 from drocap_ros.simulation.simulated_person import simulate_person

@@ -17,7 +17,7 @@ from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.transport import open_transport
-from drocap_ros.flight.vehicle_state import camera_rotation
+from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.msg import OrbitStatus
 from drocap_ros.observation import PoseObservation
 from drocap_ros.ros.conversions import pose2d_to_ros

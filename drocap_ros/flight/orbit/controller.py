@@ -45,7 +45,7 @@ from drocap_ros.flight.orbit.states import (
     State,
 )
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.observation import PoseObservation
 
 

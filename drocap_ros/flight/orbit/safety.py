@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
+from drocap_ros.flight.mavlink.reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.hold import (
     begin_hold,

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS, PacketOrder
 from drocap_ros.flight.mavlink.parser import CurrentMode, MavlinkParser
+from drocap_ros.flight.mavlink.reports import MAX_LOSS, PacketOrder
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 
 S = 1_000_000_000

@@ -1,7 +1,6 @@
 import numpy as np
 
-from drocap_ros.flight.vehicle_filter import PoseHistory
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import PoseHistory, VehicleState
 
 S = 1_000_000_000
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.flight.autopilot.px4 import PX4
-from drocap_ros.simulation.vehicle.dynamics import Body, EstimateError
+from drocap_ros.simulation.vehicle.copter_reports import Body, EstimateError
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target, control_of
 from lab.flights.replay import Case, load_recorded, replay
 
