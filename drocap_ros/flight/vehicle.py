@@ -162,8 +162,6 @@ class CameraPose(NamedTuple):
 class PoseHistory:
     """States of the last seconds, by their stamps.
 
-    Parameters
-    ----------
     keep_s : how far back
     """
 
@@ -250,8 +248,6 @@ class Doubt(NamedTuple):
 class VehicleFilter:
     """Reports of one flight, in the order of their stamps.
 
-    Parameters
-    ----------
     velocity_sd_m_s : of the reported velocity, until the flight has shown it
 
     Attributes

@@ -40,8 +40,6 @@ class LoadShedding:
     def level(self, now_s: float, queued: bool, backlog: int) -> int:
         """Level for the current image.
 
-        Parameters
-        ----------
         now_s : monotonic time
         queued : whether the image arrived while the previous one was processed
         backlog : number of images still queued
@@ -123,8 +121,6 @@ LEAN = {
 class OwnProcess(Generic[_P, _R]):
     """A function, or a method whose object lives on there, with one BLAS thread: results are those of this process.
 
-    Parameters
-    ----------
     call : with its object, its arguments and its results it can be pickled
 
     The package's messages are those of the level that this process has now.

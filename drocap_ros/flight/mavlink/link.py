@@ -39,8 +39,6 @@ logger = logging.getLogger(__name__)
 class MavlinkLink:
     """Link to one autopilot.  Use as a context manager, and either call :meth:`spin_once` or :meth:`run`.
 
-    Parameters
-    ----------
     config : where to connect, what to request
     clock_ns : our clock, ns; that of the stamps
     monotonic_s : clock of the periods and of silence
