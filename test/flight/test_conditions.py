@@ -48,11 +48,6 @@ def test_a_condition_names_its_cause():
     assert str(CommandAnswer(False, fault)) == f"refused: {fault}"
 
 
-def test_a_camera_that_changes_need_not_have_zoomed():
-    words = str(condition(ConditionCode.CAMERA_CHANGED, before_px=1108.0, now_px=1663.0))  # 1280 and 1920 px, same lens
-    assert "image size" in words
-
-
 def test_an_age_before_the_first_message_reads_never():
     assert str(condition(ConditionCode.LINK_SILENT, age_s=float("inf"))).endswith("last message: never")
     assert str(condition(ConditionCode.LINK_SILENT, age_s=0.31)).endswith("last message: 0.3 s ago")

@@ -250,11 +250,6 @@ def test_options_out_of_range_are_refused(words, capsys):
     assert error.count("\n") == 1
 
 
-def test_option_that_is_no_number_is_refused(capsys):
-    assert main(["orbit", "start", "--radius", "six"]) == 2
-    assert "--radius: invalid float value: 'six'" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("line", "words"),
     [

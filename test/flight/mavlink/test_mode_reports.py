@@ -101,30 +101,6 @@ def test_before_the_first_heartbeat_a_number_has_no_name():
     assert read(packets([current_mode("OFFBOARD")])).mode == ""
 
 
-def test_a_late_report_of_the_mode_before_is_no_news():
-    before, change, after = packets([heartbeat("LOITER"), heartbeat("LOITER"), current_mode("OFFBOARD")])
-    modes = read([before, after])
-    modes.take_heard()
-    estimator = VehicleStateEstimator()
-    for message in (before, after):
-        estimator.update(message, S)
-    estimator.modes.take_heard()
-    estimator.update(change, S + 1)
-    assert (estimator.modes.mode, estimator.modes.take_heard()) == ("OFFBOARD", frozenset())
-
-
-def test_a_late_report_of_a_mode_in_between_is_heard():
-    estimator = VehicleStateEstimator()
-    first, between, last = packets([heartbeat("OFFBOARD"), current_mode("RTL"), current_mode("OFFBOARD")])
-    for message in (first, last):
-        estimator.update(message, S)
-    estimator.modes.take_heard()
-    age_s = estimator.modes.age_s(2 * S)
-    estimator.update(between, S + 10)
-    assert (estimator.modes.mode, estimator.modes.take_heard()) == ("OFFBOARD", {"RTL"})
-    assert estimator.modes.age_s(2 * S) == age_s
-
-
 @given(
     st.lists(st.tuples(st.booleans(), st.sampled_from(sorted(MODES))), min_size=1, max_size=24),
     st.randoms(use_true_random=False),

@@ -272,14 +272,6 @@ def test_without_the_permission_to_change_the_mode_the_pilot_or_the_configuratio
     assert "mode_change_allowed" in way_out(Ready(), px4, mode_change_allowed=False)
 
 
-def test_where_the_speed_decides_the_words_of_a_near_subject_name_its_share():
-    near = changed(GOOD, subject_distance_m=7.1, closing_m_s=4.0)
-    words = str(reduce(orbiting(), near, 1.0, None, LIMITS)[0].condition)
-    room_m = float(words.split("the last ")[1].split(" m")[0])
-    assert "7.1 m away" in words
-    assert 7.1 - room_m < 3.0
-
-
 def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():
     limits = LIMITS._replace(warm_up_s=1.2)
     state, decision = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, limits)

@@ -174,13 +174,3 @@ def test_a_missing_camera_info_is_named_until_it_arrives():
     loop.controller.on_camera(loop.matrix)
     loop.run(7.0)
     assert loop.status.condition.code == ConditionCode.ALL_CLEAR
-
-
-def test_a_commanded_orbit_is_refused_in_flight():
-    loop = OrbitLoop(LoopSettings(mount="fixed", camera_pitch_deg=6.0, seconds=8, seed=1))
-    loop.start()
-    loop.run(4.3)
-    _, answer = loop.answers[-1]
-    assert not answer.accepted
-    assert answer.condition.code == ConditionCode.PERSON_LEAVES_PICTURE
-    assert loop.controller.safety.state != State.ORBITING
