@@ -248,13 +248,14 @@ class MavlinkLink:
         if message.get_srcSystem() != self.estimator.system_id or self.estimator.component_id == 0:
             return state
         self._heard_s = self._monotonic_s()
-        self._transport.accept_peer()
         kind = self.estimator.modes.autopilot
         if kind is not None and kind is not self._autopilot:
             self._adopt(kind)
         self._requests.count(message.get_msgId(), now_ns)
-        # A gimbal, a camera or another companion of this vehicle answers for itself alone.
+        # A gimbal, a camera or another companion of this vehicle answers for itself alone, and may have its own port.
         if message.get_srcComponent() == self.estimator.component_id:
+            if name == "HEARTBEAT":
+                self._transport.accept_peer()
             self._take_answer(name, message, now_ns)
         return state
 

@@ -6,6 +6,9 @@ import threading
 from collections import Counter, deque
 from typing import NamedTuple
 
+#: MCAP's times are unsigned nanoseconds of 64 bits.
+_END_NS = 1 << 64
+
 
 class QueuedMessage(NamedTuple):
     """One serialized message."""
@@ -47,7 +50,8 @@ class BoundedQueue:
                     _, victim = self._images.popleft()
                     self.size -= len(victim.data)
                     self.dropped[victim.topic] += 1
-            if self.closed or self.size + size > limit:
+            stamped = 0 <= message.log_time_ns < _END_NS and 0 <= message.publish_time_ns < _END_NS
+            if self.closed or not stamped or self.size + size > limit:
                 self.dropped[message.topic] += 1
                 return False
             (self._images if image else self._others).append((self._arrivals, message))

@@ -128,7 +128,7 @@ class SessionWriter:
             self._description_changed = True
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> bool:
-        """Queue one serialized (CDR) message; False when it was dropped."""
+        """Queue one serialized (CDR) message; False when it was dropped, as one of a time before 1970 is."""
         if topic not in self._topics:
             raise InputError(f"{topic}: expected a registered topic; call register first")
         published_ns = log_time_ns if publish_time_ns is None else publish_time_ns
