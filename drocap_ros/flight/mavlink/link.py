@@ -20,12 +20,12 @@ from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.commands import TELEMETRY_COMMANDS, Message, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.guardian import PACKETS
-from drocap_ros.flight.mavlink.mount import Mount
 from drocap_ros.flight.mavlink.parser import MavlinkParser, Packer, read_signing_key
+from drocap_ros.flight.mavlink.reports import Mount
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.mavlink.telemetry_request import AutopilotSettings, LinkStatus, TelemetryRequests
 from drocap_ros.flight.mavlink.transport import LinkError, Transport, open_transport
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.stamps import NS
 
 _RECONNECT_S = 1.0  # between tries to open a broken link again
@@ -39,8 +39,6 @@ logger = logging.getLogger(__name__)
 class MavlinkLink:
     """Link to one autopilot.  Use as a context manager, and either call :meth:`spin_once` or :meth:`run`.
 
-    Parameters
-    ----------
     config : where to connect, what to request
     clock_ns : our clock, ns; that of the stamps
     monotonic_s : clock of the periods and of silence

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
+from drocap_ros.flight.mavlink.reports import MAX_LOSS
+from drocap_ros.flight.mavlink.telemetry_request import CURRENT_MODE_HZ
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.hold import (
     begin_hold,
@@ -52,7 +53,7 @@ from drocap_ros.flight.orbit.watchdog import GIVE_UP_S
 _C = ConditionCode
 _BLIND_MODE_REQUEST_S = 2.0  # of velocity zero, from 2.5 m/s at braking_m_s2: a brake by the mode takes longer
 _CLEAR_S = 1.0  # for which all conditions hold before an orbit resumes by itself
-_INTENTION_S = 1.0  # two periods of CURRENT_MODE, which says what is intended
+_INTENTION_S = 2.0 / CURRENT_MODE_HZ  # two periods of CURRENT_MODE, which says what is intended
 
 
 def reduce(
@@ -60,8 +61,6 @@ def reduce(
 ) -> tuple[SafetyState, Decision]:
     """One step of the machine.
 
-    Parameters
-    ----------
     now_s : monotonic
     command : the operator's, or None
 

@@ -5,8 +5,6 @@ import math
 import os
 import random
 import socket
-import subprocess
-import sys
 import threading
 import time
 
@@ -22,7 +20,7 @@ from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.mavlink.transport import open_transport
-from drocap_ros.flight.vehicle_state import camera_rotation
+from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.simulation.vehicle.mavlink_vehicle import HOME, SimulatedVehicle, orbit_path
 
 S = 1_000_000_000
@@ -138,27 +136,6 @@ def test_link_thread_delivers_states_and_stops(port):
         thread.join(2)
         assert not thread.is_alive()
     assert len(states) >= 5
-
-
-def test_link_to_a_vehicle_process(port):
-    command = [
-        sys.executable,
-        "-m",
-        "drocap_ros.simulation.vehicle.mavlink_vehicle",
-        "--url",
-        f"udpout:127.0.0.1:{port}",
-        "--autopilot",
-        "px4",
-        "--seconds",
-        "30",
-    ]
-    with MavlinkLink(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")) as link:
-        process = subprocess.Popen(command)
-        try:
-            assert spin_until(link, lambda s: len(s) > 3)[-1].autopilot == "px4"
-        finally:
-            process.terminate()
-            process.wait(5)
 
 
 def test_link_over_tcp(port):
