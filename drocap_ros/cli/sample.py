@@ -36,7 +36,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fetch, convert, reconstruct."""
+    """Fetch and reconstruct."""
     from drocap_ros.cli.atomic_output import check_output_folder
 
     check_output_folder(args.out)

@@ -93,11 +93,12 @@ def setup_of(config: DrocapConfig, models: Path | None = None) -> Setup:
     """Camera, source and networks that a configuration names."""
     from drocap_ros.flight.preflight.setup_checks import Setup
     from drocap_ros.perception.load_models import models_folder
+    from drocap_ros.perception.models.runtime import network_files
 
     ingest = config.image_ingest
     matrix, size, words = _camera(ingest)
     folder = models_folder(models or config.pose_estimator.models_dir)
-    present = folder.is_dir() and any(folder.glob("*.onnx"))
+    present = folder.is_dir() and bool(network_files(folder))
     return Setup(
         camera_matrix=matrix, image_size=size, camera_words=words, calibrated=bool(ingest.calibration_file),
         source=ingest.source, assumed_height_m=config.initializer.assumed_height_m,

@@ -11,7 +11,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.detection.decode import DECODERS
 from drocap_ros.perception.detection.nms import suppress
 from drocap_ros.perception.models.network_input import Normalizer, letterbox
-from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.runtime import Model
 from drocap_ros.perception.models.spec import ModelSpec, map_grid
 
 #: Sides of an input are multiples of the coarsest map's stride, px.
@@ -36,7 +36,7 @@ class Detections:
 class Detector:
     """A detector model with its spec."""
 
-    def __init__(self, model: OnnxModel, spec: ModelSpec) -> None:
+    def __init__(self, model: Model, spec: ModelSpec) -> None:
         self.model = model
         self.spec = spec
         self._normalize = Normalizer(spec)

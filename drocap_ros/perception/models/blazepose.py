@@ -1,44 +1,27 @@
-"""BlazePose (Bazarevsky et al., 2020) as this package's networks: its two TensorFlow Lite files with our outputs.
+"""BlazePose (Bazarevsky et al., 2020): outputs of its two TensorFlow Lite files as those of this package's layouts.
 
-The detector's output becomes that of the layout ``yolo``, a box for each anchor; the pose network's that of
-``movenet``, the joints of ``coco21``.  MediaPipe's graphs ``pose_detection`` and ``pose_landmark`` give the meaning of
-the numbers.
+The detector's become a box for each anchor (``yolo``), those of the pose network the joints of ``coco21``
+(``movenet``).  MediaPipe's graphs ``pose_detection`` and ``pose_landmark`` give the meaning of the numbers.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
-
 import numpy as np
 
-from drocap_ros.perception.models.tflite import as_onnx, node
-
-if TYPE_CHECKING:
-    import onnx
-
-#: Names of the written networks.
-DETECTOR, POSE = "blazepose-detector", "blazepose-full"
+from drocap_ros.errors import InputError
 
 #: Side of the detector's input, px, and the strides of its anchors: two anchors a cell for each entry.
 _SIDE = 224
 _STRIDES = (8, 16, 32, 32, 32)
 #: Of a raw row of the detector: the middle of the hips, and a point on the circle about it that holds the body.
 _HIPS, _CIRCLE = slice(4, 6), slice(6, 8)
-#: Width of a standing person's box over its height; the network gives a circle.
-_SLENDER = 0.5
-
+#: Width and height of a standing person's box over the circle's radius.
+_SIDES = np.array([1.0, 2.0], np.float32)
 #: Least score of MediaPipe's detector; trees and furniture reach it.  Scores from here to 1 become those from 0 to 1.
 _LEAST = 0.5
-
-#: BlazePose's 39 points, of which these are the joints of ``coco21``.
+#: Side of the pose network's input, px, and its 39 points, of which these are the joints of ``coco21``.
+_POSE_SIDE, _POINTS = 256, 39
 _COCO_21 = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28, 31, 32, 29, 30)
-
-#: ONNX's version of the operators, and of the file: what the oldest onnxruntime of this package reads.
-_OPERATORS, _FILE = 17, 8
-
-_DETECTOR_YAML = "layout: yolo\ninput_size: [224, 224]\nmean: [127.5, 127.5, 127.5]\nstd: [127.5, 127.5, 127.5]\n"
-_POSE_YAML = "layout: movenet\nskeleton: coco21\nstd: [255, 255, 255]\n"
 
 
 def anchors() -> np.ndarray:
@@ -52,79 +35,35 @@ def anchors() -> np.ndarray:
     return np.concatenate(centres).astype(np.float32)
 
 
-def write_blazepose(tflite: Path, target: Path) -> None:
-    """Write one of both networks with its YAML; the stem of ``target`` says which.
-
-    Parameters
-    ----------
-    tflite : MediaPipe's ``pose_detection.tflite`` or ``pose_landmark_full.tflite`` (or lite, heavy)
-    """
-    import onnx
-    from onnx import helper, numpy_helper
-
-    head, yaml = (_detector_head, _DETECTOR_YAML) if target.stem == DETECTOR else (_pose_head, _POSE_YAML)
-    graph, outputs = as_onnx(tflite)
-    nodes, constants, shapes = head(outputs)
-    graph.node.extend(nodes)
-    graph.initializer.extend(numpy_helper.from_array(value, key) for key, value in constants.items())
-    del graph.output[:]
-    graph.output.extend(
-        helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape) for name, shape in shapes.items()
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPERATORS)], ir_version=_FILE)
-    onnx.checker.check_model(model)
-    target.with_suffix(".yaml").write_text(yaml, encoding="ascii")
-    onnx.save(model, target)
+def as_layout(outputs: list[np.ndarray]) -> list[np.ndarray]:
+    """The outputs of either network in its layout: ``yolo``, ``movenet`` with joints in space."""
+    shapes = [output.shape for output in outputs]
+    if shapes == [(1, 2254, 12), (1, 2254, 1)]:
+        return [_people(outputs[0], outputs[1])]
+    if len(shapes) == 5 and shapes[0] == (1, 5 * _POINTS) and shapes[4] == (1, 3 * _POINTS):
+        return _joints(outputs[0], outputs[1], outputs[4])
+    raise InputError(f"expected the detector or pose network BlazePose, found outputs {', '.join(map(str, shapes))}")
 
 
-#: Nodes, constants, shapes of the outputs.
-_Head: TypeAlias = "tuple[list[onnx.NodeProto], dict[str, np.ndarray], dict[str, tuple[int, ...]]]"
+def _people(rows: np.ndarray, logits: np.ndarray) -> np.ndarray:
+    """(1, 5, 2254): cx cy w h px and score of a standing person."""
+    hips, circle = rows[..., _HIPS], rows[..., _CIRCLE]
+    sides = np.linalg.norm(circle - hips, axis=2, keepdims=True) * _SIDES
+    score = (_sigmoid(logits) - _LEAST) / (1 - _LEAST)
+    rows = np.concatenate([hips + anchors(), sides, score], axis=2)
+    return np.asarray(rows.swapaxes(1, 2))
 
 
-def _detector_head(outputs: list[str]) -> _Head:
-    """Rows (1, 5, 2254): cx cy w h px and score of a standing person."""
-    rows, logits = outputs
-    constants = {
-        "hips": np.arange(_HIPS.start, _HIPS.stop), "circle": np.arange(_CIRCLE.start, _CIRCLE.stop),
-        "anchors": anchors()[None], "size": np.array([2 * _SLENDER, 2.0], np.float32),
-        "least": np.array(_LEAST, np.float32), "rest": np.array(1 - _LEAST, np.float32),
-    }  # fmt: skip
-    nodes = [
-        node("Gather", [rows, "hips"], "from_anchor", axis=2),
-        node("Gather", [rows, "circle"], "on_circle", axis=2),
-        node("Add", ["from_anchor", "anchors"], "centre"),
-        node("Sub", ["on_circle", "from_anchor"], "spoke"),
-        node("ReduceL2", ["spoke"], "radius", axes=[2]),
-        node("Mul", ["radius", "size"], "sides"),
-        node("Sigmoid", [logits], "share"),
-        node("Sub", ["share", "least"], "above"),
-        node("Div", ["above", "rest"], "score"),
-        node("Concat", ["centre", "sides", "score"], "people", axis=2),
-        node("Transpose", ["people"], "out", perm=[0, 2, 1]),
-    ]
-    return nodes, constants, {"out": (1, 5, 2254)}
-
-
-def _pose_head(outputs: list[str]) -> _Head:
-    """Rows (1, 1, 21, 3): y, x as shares of the input, and the visibility, less where the network sees nobody.
+def _joints(rows: np.ndarray, person: np.ndarray, space: np.ndarray) -> list[np.ndarray]:
+    """(1, 1, 21, 3): y, x as shares of the input, and the visibility, less where the network sees nobody.
 
     And the joints in space (1, 21, 3): m about the hips' middle, x right, y down, z away along the ray to it.
     """
-    rows, person, space = outputs[0], outputs[1], outputs[4]
-    constants = {
-        "points": np.array([1, 1, 39, 5]), "joints": np.array(_COCO_21), "side": np.array(1 / 256, np.float32),
-        "yx": np.array([1, 0]), "visibility": np.array([3]), "in_space": np.array([1, 39, 3]),
-    }  # fmt: skip
-    nodes = [
-        node("Reshape", [rows, "points"], "all_points"),
-        node("Gather", ["all_points", "joints"], "coco", axis=2),
-        node("Gather", ["coco", "yx"], "yx_px", axis=3),
-        node("Mul", ["yx_px", "side"], "places"),
-        node("Gather", ["coco", "visibility"], "logits", axis=3),
-        node("Sigmoid", ["logits"], "visible"),
-        node("Mul", ["visible", person], "score"),
-        node("Concat", ["places", "score"], "out", axis=3),
-        node("Reshape", [space, "in_space"], "all_space"),
-        node("Gather", ["all_space", "joints"], "space", axis=1),
-    ]
-    return nodes, constants, {"out": (1, 1, len(_COCO_21), 3), "space": (1, len(_COCO_21), 3)}
+    points = rows.reshape(1, 1, _POINTS, -1)[:, :, list(_COCO_21)]
+    seen = _sigmoid(points[..., 3:4]) * person
+    places = np.concatenate([points[..., [1, 0]] / _POSE_SIDE, seen], axis=3)
+    return [places.astype(np.float32), space.reshape(1, _POINTS, 3)[:, list(_COCO_21)]]
+
+
+def _sigmoid(values: np.ndarray) -> np.ndarray:
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * values))

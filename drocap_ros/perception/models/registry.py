@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from drocap_ros.perception.models.wheel import Package
 
@@ -17,14 +18,14 @@ class KnownModel:
     name : on the command line
     task : "detector" or "pose"
     file : name in the models folder
-    size_mb : of the ONNX file
+    size_mb : of the file
     licence : of the weights, as their publisher states it
     training_data : data sets of the training; their terms may restrict commercial use
     home : publisher
     url : the file or a ZIP archive with it; empty = no download
     member : end of the file's path in the archive; empty = the download is the file itself
-    sha256 : of the ONNX file; empty = no download, or one that is converted
-    package : wheel whose ``member`` is converted, a network of TensorFlow Lite; its sum is pinned
+    sha256 : of the file; empty = no download
+    package : wheel whose ``member`` it is, a network of TensorFlow Lite; its sum is pinned
     """
 
     name: str
@@ -94,12 +95,14 @@ KNOWN_MODELS: tuple[KnownModel, ...] = (
         "Google",
     ),
     KnownModel(
-        "blazepose-detector", "detector", "blazepose-detector.onnx", 9.5, "Apache-2.0", "Google's pictures",
-        "PyPI, mediapipe 0.10.21", member=f"{_MODULES}/pose_detection/pose_detection.tflite", package=_MEDIAPIPE,
+        "blazepose-detector", "detector", "blazepose-detector.tflite", 3.0, "Apache-2.0", "Google's pictures",
+        "PyPI, mediapipe 0.10.21", member=f"{_MODULES}/pose_detection/pose_detection.tflite",
+        sha256="9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c", package=_MEDIAPIPE,
     ),
     KnownModel(
-        "blazepose-full", "pose", "blazepose-full.onnx", 12.9, "Apache-2.0", "Google's pictures",
-        "PyPI, mediapipe 0.10.21", member=f"{_MODULES}/pose_landmark/pose_landmark_full.tflite", package=_MEDIAPIPE,
+        "blazepose-full", "pose", "blazepose-full.tflite", 6.4, "Apache-2.0", "Google's pictures",
+        "PyPI, mediapipe 0.10.21", member=f"{_MODULES}/pose_landmark/pose_landmark_full.tflite",
+        sha256="e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f", package=_MEDIAPIPE,
     ),
 )  # fmt: skip
 
@@ -109,5 +112,4 @@ DEFAULT_FETCH = ("rtmdet-nano", "rtmpose-s")
 
 def known_model(name: str) -> KnownModel | None:
     """Registry entry by its name or file name."""
-    stem = name.removesuffix(".onnx")
-    return next((m for m in KNOWN_MODELS if stem in (m.name, m.file.removesuffix(".onnx"))), None)
+    return next((m for m in KNOWN_MODELS if name in (m.name, m.file, Path(m.file).stem, f"{m.name}.onnx")), None)

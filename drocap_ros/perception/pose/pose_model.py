@@ -9,7 +9,7 @@ import numpy as np
 from drocap_ros.perception.detection.decode import DECODERS
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.models.network_input import Normalizer, crop_around, cut
-from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.runtime import Model
 from drocap_ros.perception.models.spec import ModelSpec
 from drocap_ros.perception.pose.peaks import Peaks, certain_peaks, decode_heatmaps, decode_movenet, decode_simcc
 from drocap_ros.skeleton import JointSet, joint_set
@@ -40,7 +40,7 @@ class NetworkKeypoints(NamedTuple):
 class PoseModel:
     """A pose network with its spec; ``joints`` is its joint set."""
 
-    def __init__(self, model: OnnxModel, spec: ModelSpec) -> None:
+    def __init__(self, model: Model, spec: ModelSpec) -> None:
         self.model = model
         self.spec = spec
         self.joints: JointSet = joint_set(spec.skeleton)
