@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import signal
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+from other_programs import MARK, Moment, moment, used_by_others
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -49,8 +52,14 @@ def group(file: str) -> str:
     return "counting" if file.startswith(COUNTING) else "clock"
 
 
+#: Processors that other programs use, as a share of all, from which a failed test of nodes or time says nothing.
+BUSY = 0.25
+BEGUN = pytest.StashKey[Moment]()
+
+
 def pytest_configure() -> None:
-    """Let tests interrupt processes in a shell's background job, too: it ignores SIGINT, and so would they."""
+    """Mark the processes of this run; let tests interrupt those in a shell's background job, which ignores SIGINT."""
+    os.environ.setdefault(MARK, str(os.getpid()))
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -74,11 +83,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Let a repeated test prepare its module again: the flight that it looks at was disturbed too."""
+    if group(file_of(item.path)):
+        item.stash[BEGUN] = moment()
     if getattr(item, "execution_count", 1) > 1:
         for definitions in item._fixtureinfo.name2fixturedefs.values():  # type: ignore[attr-defined]
             for definition in definitions:
                 if definition.scope == "module":
                     definition.finish(item._request)  # type: ignore[attr-defined]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """A failed test of nodes or time is skipped where other programs used much of the machine meanwhile."""
+    report: pytest.TestReport = yield
+    if report.failed and BEGUN in item.stash:
+        used, all_of = used_by_others(item.stash[BEGUN]), len(os.sched_getaffinity(0))
+        if used >= BUSY * all_of:
+            failure = str(report.longrepr).strip().splitlines()[-1:]
+            reason = f"too slow here: other programs used {used:.1f} of {all_of} processors meanwhile"
+            report.outcome = "skipped"
+            report.longrepr = (str(item.path), item.location[1] or 0, f"{reason}; {' '.join(failure)}")
+    return report
 
 
 @pytest.fixture(scope="session")

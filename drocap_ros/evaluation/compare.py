@@ -10,8 +10,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation import metrics
-from drocap_ros.evaluation.truth_files import read_truth_file
-from drocap_ros.mocap import load_mocap
+from drocap_ros.evaluation.truth_files import load_mocap, read_truth_file
 from drocap_ros.motion import Motion, load_motion, motion_file
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, in_body_order, indices
 from drocap_ros.tracks import kind_of, read_npz, wrong_kind

@@ -18,8 +18,8 @@ import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.skeleton import BODY_17, LIMB_JOINTS, in_body_order, indices
-from drocap_ros.tracks import MAX_FRAMES
+from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, JointSet, in_body_order, indices
+from drocap_ros.tracks import MAX_FRAMES, read_npz
 
 logger = logging.getLogger(__name__)
 
@@ -291,3 +291,44 @@ _READERS: tuple[tuple[re.Pattern[bytes], Callable[[Path], _Points]], ...] = (
     (re.compile(rb"\s*HIERARCHY"), _read_bvh),
     (re.compile(rb"PathFileType"), _read_trc),
 )
+
+
+def load_mocap(
+    path: Path, required: tuple[str, ...] = BODY_15.joints, joints: JointSet = BODY_15
+) -> tuple[np.ndarray, float]:
+    """Joints (T, P, 3) mm, world z up, and frames per second of one MoCap ``.npz``.
+
+    Toes are further joints of ``X``, or the array ``toes`` (T, 2, 3) with their names in ``toe_joints``.  Where
+    ``toe_kind`` is "ball", the array holds the balls of the feet, which are no joints of the body.
+
+    Parameters
+    ----------
+    required : joints that the file must hold; others that it lacks are NaN
+    joints : ``BODY_15`` or ``BODY_17``, those of the result
+    """
+    a = read_npz(path, ("X", "fps", "joints"))
+    try:
+        x, names = _named_joints(a)
+        fps = a["fps"]
+        if fps.size != 1 or fps.dtype.kind not in "iuf" or not 1.0 <= float(fps.item()) <= 1000.0:
+            raise InputError(f"fps: expected a number from 1 to 1000, got {fps}")
+        body = in_body_order(x, names, required)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return body[:, : len(joints)], float(fps.item())
+
+
+def _named_joints(a: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str]]:
+    """Joints (T, P, 3) mm of a file with its toes, and their names (P)."""
+    x, names = a["X"], [str(j) for j in a["joints"]]
+    if x.ndim != 3 or x.shape[1:] != (a["joints"].size, 3) or len(x) == 0:
+        raise InputError(f"X: expected (T, {a['joints'].size}, 3), got {x.shape}")
+    if "toes" in a and str(a.get("toe_kind", "tip")) == "tip":
+        toes = [str(j) for j in np.atleast_1d(a.get("toe_joints", ("rtoe", "ltoe")))]
+        if a["toes"].shape != (len(x), len(toes), 3):
+            raise InputError(f"toes: expected {(len(x), len(toes), 3)}, got {a['toes'].shape}")
+        x, names = np.concatenate([x, a["toes"]], axis=1), [*names, *toes]
+    x = x.astype(np.float64)
+    if not np.isfinite(x).all():
+        raise InputError("X, toes: expected finite millimetres, got NaN or infinity; fill the gaps in")
+    return x, names

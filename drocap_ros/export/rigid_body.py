@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.geometry.alignment import unit_or
 from drocap_ros.geometry.rotations import exp_so3, hat, log_so3
 from drocap_ros.skeleton import BODY_15, TOES, indices
 
@@ -54,6 +55,8 @@ _CONVERGED = 3e-4
 _DAMPING = 1e-6
 #: Frames that are solved together, to bound the memory.
 _CHUNK = 256
+#: Direction of what has none.
+_UP = np.array([0.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -199,9 +202,9 @@ class _Problem:
         for k, end in enumerate(self.ends):
             name = self.joints[end]
             foot = posed[:, self.joints.index(PARENTS[name])] if k in self.priors else at[PARENTS[name]]
-            pose.free[:, k] = _unit(at[name] - foot)
+            pose.free[:, k] = unit_or(at[name] - foot, _UP)
         local = np.einsum("fji,fkj->fki", chest, pose.free[:, self.priors])
-        self.usual = _unit(np.median(local, axis=0))
+        self.usual = unit_or(np.median(local, axis=0), _UP)
         return pose
 
     def segments(self, pose: _Pose) -> np.ndarray:
@@ -235,7 +238,7 @@ class _Problem:
                 now.root + step[:, :3],
                 exp_so3(step[:, 3:6]) @ now.pelvis,
                 exp_so3(step[:, 6:9]) @ now.chest,
-                _unit(now.free + turn),
+                unit_or(now.free + turn, _UP),
             )
             new = self._residual(moved, measured[active], scale[active])
             better = np.sum(new**2, axis=1) < np.sum(residual**2, axis=1)
@@ -283,23 +286,18 @@ class _Problem:
         return np.concatenate([joints * scale[..., None], bend, away.reshape(frames, -1, unknowns)], axis=1)
 
 
-def _unit(v: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
-    return np.where(length > 1e-9, v / np.maximum(length, 1e-9), (0.0, 1.0, 0.0))
-
-
 def _frame(left: np.ndarray, up: np.ndarray) -> np.ndarray:
     """(F, 3, 3) rotations with columns left, up (exact), forwards."""
-    y = _unit(up)
+    y = unit_or(up, _UP)
     z = np.cross(left, y)
     # A line of hips along the trunk: any perpendicular direction.
     z = np.where(np.linalg.norm(z, axis=1, keepdims=True) > 1e-6, z, _tangents(y)[..., 0])
-    z = _unit(z)
+    z = unit_or(z, _UP)
     return np.stack([np.cross(y, z), y, z], axis=-1)
 
 
 def _tangents(direction: np.ndarray) -> np.ndarray:
     """(..., 3, 2) two unit vectors perpendicular to each other and to unit vectors (..., 3)."""
     helper = np.where(np.abs(direction[..., :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    first = _unit(np.cross(direction, helper))
+    first = unit_or(np.cross(direction, helper), _UP)
     return np.stack([first, np.cross(direction, first)], axis=-1)

@@ -59,16 +59,17 @@ def torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:
         The trunk's axis is pelvis to neck; left is right-to-left over hips and shoulders.
     """
     at = {name: s[..., joints.index(name), :] for name in ("neck", "pelvis", "lhip", "rhip", "lshoulder", "rshoulder")}
-    z = _unit(at["neck"] - at["pelvis"], np.array([0.0, 0.0, 1.0]))
-    left = _unit(at["lhip"] - at["rhip"], np.zeros(3)) + _unit(at["lshoulder"] - at["rshoulder"], np.zeros(3))
+    z = unit_or(at["neck"] - at["pelvis"], np.array([0.0, 0.0, 1.0]))
+    left = unit_or(at["lhip"] - at["rhip"], np.zeros(3)) + unit_or(at["lshoulder"] - at["rshoulder"], np.zeros(3))
     left = left - np.sum(left * z, axis=-1, keepdims=True) * z
     # Without a left-right direction any axis perpendicular to z serves.
     across = np.cross(z, np.where(np.abs(z[..., :1]) < 0.9, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])))
-    y = _unit(left, _unit(across, np.zeros(3)))
+    y = unit_or(left, unit_or(across, np.zeros(3)))
     return np.stack([np.cross(y, z), y, z], axis=-1)
 
 
-def _unit(v: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+def unit_or(v: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of length 1; the fallback where they have none."""
     norm = np.linalg.norm(v, axis=-1, keepdims=True)
     good = norm > 1e-9
     return np.where(good, v / np.where(good, norm, 1.0), fallback)

@@ -5,18 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.evidence import Evidence
+from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
-from drocap_ros.skeleton import BODY_15, BODY_17, JointSet, body_set
+from drocap_ros.skeleton import BODY_15, BODY_17, TABLES, JointSet, body_set, joint_map, joint_set_of
 from drocap_ros.tracks import Tracks
 
 
 def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
     """Keypoints in the order of ``joints``, a body set; those that the tracks lack are NaN.
 
-    Names of the body sets, COCO, COCO-WholeBody, Halpe, MPII and Human3.6M are known (:mod:`drocap_ros.joint_maps`).
+    Names of the body sets, COCO, COCO-WholeBody, Halpe, MPII and Human3.6M are known (:mod:`drocap_ros.skeleton`).
     """
     source, place = joint_set_of(tracks.joints)
     have = place >= 0

@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.mocap import load_mocap
+from drocap_ros.evaluation.truth_files import load_mocap
 from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.mocap import load_mocap
+from drocap_ros.evaluation.truth_files import load_mocap
 from drocap_ros.skeleton import BODY_17, indices
 from lab.training.leg_lengths import leg_reach, refit_knees, shortening
 

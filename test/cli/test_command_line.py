@@ -38,11 +38,6 @@ def test_help_lists_every_command(capsys):
     assert len([line for line in capsys.readouterr().out.splitlines() if line.startswith("    ")]) >= len(COMMANDS)
 
 
-def test_no_word_prints_the_help(capsys):
-    assert main([]) == 0
-    assert "reconstruct" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -66,11 +61,6 @@ def test_wrong_option_gives_one_line(words, line, capsys):
     (said,) = capsys.readouterr().err.splitlines()
     assert said.startswith("drocap: ")
     assert line in said
-
-
-def test_a_word_that_is_like_nothing_gets_no_proposal(capsys):
-    assert main(["track", "a.mp4", "--wrong"]) == 2
-    assert "did you mean" not in capsys.readouterr().err
 
 
 def test_a_misspelt_parameter_gets_its_name(tmp_path, capsys):

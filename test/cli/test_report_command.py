@@ -23,12 +23,6 @@ def folder(person, tmp_path):
     return tmp_path
 
 
-def test_the_folder_of_a_motion_is_enough(folder, capsys):
-    assert main(["report", str(folder)]) == 0
-    assert capsys.readouterr().out.endswith(f"\nopen {folder}/report.html in a browser\n")
-    assert f"drocap report {folder}" in (folder / "report.html").read_text()
-
-
 def test_the_same_motion_gives_the_same_bytes(folder):
     texts = []
     for _ in range(2):

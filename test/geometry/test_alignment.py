@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from walking import make_walk
 
 from drocap_ros.geometry.alignment import apply_similarity, similarity, to_torso_frame, torso_frame
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.geometry.bones import bone_lengths, limb_lengths
+from drocap_ros.skeleton import BODY_15, RIGID_BONES
 
 
 def poses(n: int) -> np.ndarray:
@@ -62,3 +64,20 @@ def test_the_axes_point_forward_left_and_up() -> None:
 def test_a_body_without_extent_still_has_a_frame() -> None:
     frame = torso_frame(np.zeros((2, 15, 3)))
     np.testing.assert_allclose(frame @ np.swapaxes(frame, 1, 2), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-12)
+
+
+POSES = make_walk(5).shape
+
+
+def test_bone_of_a_joint_stands_one_place_before_it() -> None:
+    for joint, parent in enumerate(BODY_15.parents[1:], start=1):
+        expected = np.linalg.norm(POSES[:, joint] - POSES[:, parent], axis=-1)
+        np.testing.assert_allclose(bone_lengths(POSES)[:, joint - 1], expected)
+
+
+def test_limb_lengths_are_those_of_the_rigid_bones() -> None:
+    lengths = limb_lengths(POSES)
+    assert lengths.shape == (5, len(RIGID_BONES))
+    for column, (start, end) in zip(lengths.T, RIGID_BONES, strict=True):
+        expected = np.linalg.norm(POSES[:, BODY_15.index(end)] - POSES[:, BODY_15.index(start)], axis=-1)
+        np.testing.assert_array_equal(column, expected)

@@ -242,3 +242,10 @@ def test_smoothing_keeps_constants_and_means():
     np.testing.assert_allclose(smooth(np.full((40, 2), 3.0), times), 3.0)
     ramp = smooth(times, times)
     np.testing.assert_allclose(ramp[5:-5], times[5:-5])
+
+
+def test_a_standing_person_who_is_carried_along_has_sliding_feet(person):
+    seconds = (person.stamp_ns - person.stamp_ns[0]) * 1e-9
+    for m_s in (0.0, 0.8):
+        joints = person.joints3d[:1] + seconds[:, None, None] * np.array([m_s, 0.0, 0.0])
+        assert (MotionCheck.SLIDING_FEET in checks(dataclasses.replace(person, joints3d=joints))) == (m_s > 0)

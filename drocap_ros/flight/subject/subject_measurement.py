@@ -16,11 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.pose_history import CameraPose
-from drocap_ros.flight.subject_config import SubjectConfig
-from drocap_ros.joint_maps import joint_map
+from drocap_ros.flight.bridge_config import SubjectConfig
+from drocap_ros.flight.vehicle_filter import CameraPose
 from drocap_ros.observation import PoseObservation
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, joint_map
 
 #: Lengths as shares of the stature (Winter, Biomechanics and Motor Control of Human Movement; trunk: hips to the
 #: top of the neck): the long bones of each side and the trunk.

@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.joint_maps import joint_map
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints, PoseModel
 from drocap_ros.perception.pose.uncertainty import calibrate
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, joint_map
 
 CLEAR_CONFIDENCE = 0.8  # mean confidence of a clear pose; persons in bad light or from steeply above have 0.5 to 0.9
 _SEEN = 0.3  # least confidence of a joint that counts: boxes without a person have a mean below 0.33
