@@ -44,13 +44,19 @@ class FoundPerson:
         return dataclasses.replace(self, boxes=boxes) if boxes else None
 
 
-class PersonSearch:
-    """Finds all persons of a stream by five detections a second."""
+class PersonFinder:
+    """Finds the persons of a recording by five detections a second, and numbers them at the end.
+
+    A person that leaves the image and returns later counts as another one.
+    """
 
     def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig) -> None:
         # Without a box of the drone the rule `roi` never chooses a subject: all persons are bystanders.
         self.estimator = PoseEstimator(models_dir, dataclasses.replace(config, subject="roi", subject_box=""))
+        self._least = config.confirm_frames
         self._last_ns: int | None = None
+        self._seen: dict[Person, dict[int, np.ndarray]] = {}
+        self._images = 0
 
     def due(self, stamp_ns: int) -> bool:
         """Whether the image of this time is one in which persons are sought."""
@@ -61,27 +67,9 @@ class PersonSearch:
         """Those detected in the next image that is due, (H, W, 3) uint8 BGR."""
         self._last_ns = stamp_ns
         self.estimator.process(image, stamp_ns)
-        # A track that clutter has taken over is a person's up to there.
-        found = [p for p in self.estimator.tracker.persons if p.detected_ns == stamp_ns]
-        return [person for person in found if person.mean_score >= _LEAST_SCORE]
-
-
-class PersonFinder(PersonSearch):
-    """Finds the persons of a recording, who are numbered at the end.
-
-    A person that leaves the image and returns later counts as another one.
-    """
-
-    def __init__(self, models_dir: str | Path, config: PoseEstimatorConfig) -> None:
-        super().__init__(models_dir, config)
-        self._least = config.confirm_frames
-        self._seen: dict[Person, dict[int, np.ndarray]] = {}
-        self._images = 0
-
-    def find(self, image: np.ndarray, stamp_ns: int) -> list[Person]:
-        """Those detected in the next image that is due, (H, W, 3) uint8 BGR."""
-        found = super().find(image, stamp_ns)
         self._images += 1
+        # A track that clutter has taken over is a person's up to there.
+        found = [p for p in self.estimator.tracker.detected(stamp_ns) if p.mean_score >= _LEAST_SCORE]
         for person in found:
             self._seen.setdefault(person, {})[stamp_ns] = person.box
         return found
@@ -112,11 +100,6 @@ def find_persons(
         if finder.due(frame.stamp_ns):
             finder.find(frame.image, frame.stamp_ns)
     return list(finder.numbered().values())
-
-
-def in_view(persons: Sequence[Person], stamp_ns: int) -> int:
-    """Number of persons detected in the image of this stamp and in one before."""
-    return sum(p.detected_ns == stamp_ns and p.hits > 1 and p.mean_score >= _LEAST_SCORE for p in persons)
 
 
 def following(config: PoseEstimatorConfig, persons: Sequence[FoundPerson], number: int) -> PoseEstimatorConfig:
