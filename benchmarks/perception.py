@@ -26,8 +26,8 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import load_detector, load_pose_model
 from drocap_ros.perception.models.runtime import network_files, open_model
 from drocap_ros.perception.models.spec import read_spec
+from drocap_ros.perception.pose.body_pose import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints, PoseModel
-from drocap_ros.perception.pose.uncertainty import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.sources.image_files import read_image
 from drocap_ros.perception.track_video import observe, subjects

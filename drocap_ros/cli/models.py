@@ -13,7 +13,7 @@ from drocap_ros.errors import DrocapError, InputError
 
 if TYPE_CHECKING:
     from drocap_ros.observation import PoseObservation
-    from drocap_ros.perception.models.registry import KnownModel
+    from drocap_ros.perception.models.fetch import KnownModel
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -53,7 +53,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run_list(args: argparse.Namespace) -> int:
     """Print the registry and the files of the folder."""
     from drocap_ros.perception.load_models import SIMULATION, models_folder
-    from drocap_ros.perception.models.registry import KNOWN_MODELS
+    from drocap_ros.perception.models.fetch import KNOWN_MODELS
     from drocap_ros.perception.models.runtime import network_files
     from drocap_ros.perception.models.spec import write_specs
 
@@ -102,7 +102,7 @@ def describe(path: Path) -> str:
 def run_fetch(args: argparse.Namespace) -> int:
     """Download the named models."""
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, known_model
+    from drocap_ros.perception.models.fetch import DEFAULT_FETCH, KNOWN_MODELS, known_model
 
     chosen = []
     for name in args.names or DEFAULT_FETCH:
@@ -161,7 +161,7 @@ def ensure_networks(folder: Path, source: str | Path, args: argparse.Namespace) 
     It needs ``--fetch``, or a yes at the terminal.
     """
     from drocap_ros.open_images import open_images
-    from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, known_model
+    from drocap_ros.perception.models.fetch import DEFAULT_FETCH, KNOWN_MODELS, known_model
     from drocap_ros.perception.models.runtime import network_files
 
     names = () if network_files(folder) else DEFAULT_FETCH
@@ -195,8 +195,7 @@ def _agreed(lack: str, pair: str) -> bool:
 def fetch_models(models: Sequence[KnownModel], folder: Path, *, quiet: bool = False) -> list[str]:
     """Download models and print one line for each; returns the failures of network or server."""
     from drocap_ros.cli.running import progress_bars
-    from drocap_ros.perception.models.fetch import fetch
-    from drocap_ros.perception.models.wheel import FetchError
+    from drocap_ros.perception.models.fetch import FetchError, fetch
 
     errors = []
     with progress_bars(quiet) as progress:

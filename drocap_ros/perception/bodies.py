@@ -9,13 +9,10 @@ import numpy as np
 
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.detection.nms import overlap_coefficient
-from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
-from drocap_ros.perception.pose.feet import FeetModel
-from drocap_ros.perception.tracking.appearance import describe
-from drocap_ros.perception.tracking.body_track import BodyTrack
-from drocap_ros.perception.tracking.identity import FORGET_S, found_again
-from drocap_ros.perception.tracking.limb_colours import limb_colours
-from drocap_ros.perception.tracking.own_joints import Poses, own_joints
+from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel, FeetModel
+from drocap_ros.perception.tracking.appearance import describe, limb_colours
+from drocap_ros.perception.tracking.association import FORGET_S, found_again
+from drocap_ros.perception.tracking.own_joints import BodyTrack, Poses, own_joints
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import BODY_15, BODY_19

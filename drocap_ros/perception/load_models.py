@@ -11,7 +11,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.detection.detector import Detector
 from drocap_ros.perception.models.runtime import SUFFIXES, Model, network_files, open_model
 from drocap_ros.perception.models.spec import ModelSpec, read_spec
-from drocap_ros.perception.pose.feet import FeetModel
+from drocap_ros.perception.pose.body_pose import FeetModel
 from drocap_ros.perception.pose.pose_model import PoseModel
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 

@@ -13,10 +13,8 @@ from drocap_ros.cli.sample import CLIP
 from drocap_ros.errors import InputError
 from drocap_ros.motion import load_motion
 from drocap_ros.perception.load_models import load_detector
-from drocap_ros.perception.models.fetch import sha256_of
-from drocap_ros.perception.models.registry import known_model
+from drocap_ros.perception.models.fetch import FetchError, Package, fetch_member, known_model, sha256_of
 from drocap_ros.perception.models.runtime import open_model
-from drocap_ros.perception.models.wheel import FetchError, Package, fetch_member
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.tracks import load_tracks

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from drocap_ros.config import DrocapConfig
     from drocap_ros.flight.preflight.findings import Finding, Measured
     from drocap_ros.flight.preflight.setup_checks import Pictures, Setup
-    from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+    from drocap_ros.perception.sources.base import ImageIngestConfig
 
 _COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red"}
 #: Images of a camera whose size is not configured.

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.perception.models.fetch import sha256_of
-from drocap_ros.perception.models.registry import KNOWN_MODELS
+from drocap_ros.perception.models.fetch import KNOWN_MODELS, sha256_of
 from drocap_ros.perception.models.runtime import Model, network_files, open_model
 from drocap_ros.skeleton import JOINT_SETS
 
@@ -72,7 +71,7 @@ class ModelSpec:
     decoded : for "yolox-grid": whether the outputs are px
     udp : for "heatmap": trained with unit-length coordinates (MMPose's UDPHeatmap; its ViTPose and later HRNets)
     box_padding : side of the pose crop over that of the box
-    sigma_scale : standard deviations of its keypoints over those of :mod:`drocap_ros.perception.pose.uncertainty`
+    sigma_scale : standard deviations of its keypoints over those of :mod:`drocap_ros.perception.pose.body_pose`
     """
 
     layout: str

@@ -9,7 +9,7 @@ from tiny_models import TensorProto, heatmaps, write_model
 from drocap_ros.errors import InputError
 from drocap_ros.perception.load_models import load_pose_model
 from drocap_ros.perception.models.network_input import crop_around, cut
-from drocap_ros.perception.pose.peaks import decode_heatmaps, decode_simcc
+from drocap_ros.perception.pose.pose_model import decode_heatmaps, decode_simcc
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 IMAGE = np.zeros((400, 300, 3), np.uint8)
