@@ -152,9 +152,9 @@ def test_a_window_continues_the_one_before_without_a_step() -> None:
 
 def test_findings_are_carried_from_window_to_window() -> None:
     """After the orbit the camera stands still: no window of its own measures the scale any more."""
-    still = orbit(21.0, action="stand")
+    still = orbit(16.0, action="stand")
     joints = still.truth
-    stop = round(10.0 * FPS)
+    stop = round(8.0 * FPS)
     at = np.minimum(np.arange(len(joints)), stop)
     sway = 0.002 * np.sin(np.arange(len(joints)))[:, None]
     hover = replace(still, rotation=still.rotation[at], position=still.position[at] + sway)
