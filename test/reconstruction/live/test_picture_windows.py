@@ -77,7 +77,7 @@ def test_windows_are_in_a_world_of_the_picture_with_its_up_and_metres() -> None:
         assert "path 1" in after.window.picture
 
 
-@pytest.mark.parametrize("stride", [2, 3, 4])
+@pytest.mark.parametrize("stride", [2, 4])
 @pytest.mark.parametrize("speed_deg_s", [25.0, 0.0])
 def test_a_path_goes_on_in_windows_that_share_no_image(speed_deg_s: float, stride: int) -> None:
     true = orbit(7.0, speed_deg_s=speed_deg_s)
