@@ -16,7 +16,7 @@ RUN apt-get update && apt-get install --yes --no-install-recommends \
 # What apt does not have; --system-site-packages keeps apt's NumPy, SciPy and OpenCV.
 RUN python3 -m venv --system-site-packages /opt/drocap \
     && /opt/drocap/bin/pip install --no-cache-dir \
-        onnxruntime pymavlink "mcap>=1.6" "rosbags>=0.10" pyulog threadpoolctl c3d argcomplete "setuptools>=77" wheel
+        onnxruntime "av>=17.1" pymavlink "mcap>=1.6" "rosbags>=0.10" pyulog threadpoolctl c3d argcomplete "setuptools>=77" wheel
 
 COPY . /opt/drocap_ros
 RUN . /opt/ros/${ROS_DISTRO}/setup.sh \

@@ -28,17 +28,17 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import NodeError
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.conditions import PICTURE_CODES, ConditionCode
-from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.guardian import PACKETS, PERIOD_S
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.orbit.states import Command, State
+from drocap_ros.flight.vehicle_state import camera_rotation
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.keypoint_errors import noisy_keypoints
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
 from lab.flights.fault_causes import TIMEOUT
 from lab.flights.fault_flight import EXCURSION_M, MOTION_S, Bounds
 from lab.flights.orbit_loop import LoopSettings

@@ -187,7 +187,7 @@ def measure_load(
     video: Path, session: Path, processes: bool, adjuster: bool, args: argparse.Namespace
 ) -> dict[str, Any]:
     from drocap_ros.bringup import bringup
-    from drocap_ros.simulation.vehicle.ports import free_udp_port
+    from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
     nodes = [name for name in NODES if adjuster or name != "bundle_adjuster"]
     port = free_udp_port()
@@ -315,7 +315,7 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     from drocap_ros.bringup import bringup
     from drocap_ros.recording.open_session import open_session
     from drocap_ros.ros.topics import TOPICS
-    from drocap_ros.simulation.vehicle.ports import free_udp_port
+    from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
     video, session, port = stream(folder, seamless=True), folder / "session", free_udp_port()
     results: dict[str, Any] = {"load average before": round(os.getloadavg()[0], 2)}

@@ -28,17 +28,18 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.parameters import Values
-from drocap_ros.reconstruction.common.threads import blas_threads
-from drocap_ros.ros import fastdds
+from drocap_ros.reconstruction.common.engine import blas_threads
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.graph import Graph, Runner
 from drocap_ros.ros.lockstep import Lockstep
 from drocap_ros.ros.own_process import environment
 from drocap_ros.ros.processes import (
     DEFAULT_NAMESPACE,
+    RANGE_VARIABLE,
     STOP_TIMEOUT_S,
     LaunchContext,
     NodeProcess,
+    middleware,
     node_class,
     remaps,
 )
@@ -87,7 +88,7 @@ def bringup(
     with contextlib.ExitStack() as stack:
         if domain_id is None:
             domain_id = stack.enter_context(free_domain())
-            stack.enter_context(environment({fastdds.RANGE_VARIABLE: "LOCALHOST"}))
+            stack.enter_context(environment({RANGE_VARIABLE: "LOCALHOST"}))
         graph = stack.enter_context(watch(namespace, domain_id, names))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="drocap_bringup_")))
         launch = LaunchContext(names, namespace, domain_id, folder) if processes else None
@@ -115,7 +116,7 @@ def bringup(
 def watch(namespace: str, domain_id: int, names: Sequence[str] = ()) -> Iterator[Graph]:
     """Observe a running graph: a node in its namespace and domain, for the script's own endpoints."""
     context = Context()
-    with environment(fastdds.environment()):
+    with environment(middleware()):
         rclpy.init(args=[], context=context, domain_id=domain_id)
         node = Node("bringup", context=context, namespace=namespace, use_global_arguments=False)
     try:
@@ -150,8 +151,8 @@ def lockstep(
     overrides = [Parameter("use_sim_time", value=True), Parameter("graph_nodes", value=",".join(names))]
     with contextlib.ExitStack() as stack:
         domain_id = stack.enter_context(free_domain())
-        stack.enter_context(environment({fastdds.RANGE_VARIABLE: "LOCALHOST"}))
-        stack.enter_context(environment(fastdds.environment()))
+        stack.enter_context(environment({RANGE_VARIABLE: "LOCALHOST"}))
+        stack.enter_context(environment(middleware()))
         # More threads would make the last bits depend on the machine.
         stack.enter_context(blas_threads(1))
         context = Context()

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
+    from av.stream import Stream
+
     from drocap_ros.recording.telemetry.log import TelemetryLog
-    from drocap_ros.recording.telemetry.mp4 import Track
+
 
 _VIDEOS = (".mp4", ".mov", ".lrf")
-#: Codes of ISO/IEC 14496-12 and its registry in words.
-_KINDS = {"vide": "video", "soun": "sound", "meta": "data", "tmcd": "time code", "text": "text", "sbtl": "subtitles"}
+#: Codes of the registry of ISO/IEC 14496-12 in words.
 _FORMATS = {
     "avc1": "H.264", "hvc1": "H.265", "hev1": "H.265", "vp09": "VP9", "av01": "AV1", "mp4v": "MPEG-4", "jpeg": "JPEG",
     "mp4a": "AAC", "djmd": "DJI telemetry", "dbgi": "DJI debugging data", "mebx": "metadata", "tmcd": "time code",
@@ -62,42 +63,35 @@ def telemetry_summary(path: Path) -> Summary:
 
 
 def _video_facts(path: Path) -> list[tuple[str, str]]:
-    from drocap_ros.recording.telemetry.mp4 import read_tracks
+    """Kind of each track; its format, size, samples and rate in words."""
+    from drocap_ros.errors import first_line
+    from drocap_ros.perception.sources.video import open_container, pyav, track_codes
 
-    with path.open("rb") as file:
-        facts = [_track_fact(file, track) for track in read_tracks(file)]
-    if facts:
-        return facts
-    if path.suffix.lower() not in _VIDEOS:
-        return _other_video_facts(path)
-    raise InputError(f"{path}: expected a video file (MP4, MOV) with its index, found none; copy it again")
-
-
-def _track_fact(file: BinaryIO, track: Track) -> tuple[str, str]:
-    """Kind of a track; its format, size, samples and rate in words."""
-    from drocap_ros.recording.telemetry.mp4 import read_samples
-
-    code = _printable(track.sample_format)
-    words = f"{_FORMATS[code]} ({code})" if code in _FORMATS else code
-    if track.handler == "vide":
-        words += f", {track.size[0]}x{track.size[1]} px"
+    codes = track_codes(path)
     try:
-        stamp_ns = read_samples(file, track).stamp_ns
-        span = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9 if len(stamp_ns) else 0.0
-        words += f", {len(stamp_ns)} samples" + (f", {(len(stamp_ns) - 1) / span:.2f}/s" if span > 0 else "")
-    except InputError as error:
-        words += f": {error}"
-    return f"{_KINDS.get(track.handler) or _printable(track.handler)} track", words
+        with open_container(path) as container:
+            streams = container.streams
+            return [_track_fact(s, codes[s.index] if s.index < len(codes) else "") for s in streams]
+    except pyav().error.FFmpegError as error:
+        raise InputError(
+            f"{path}: expected a video file with its index, found none ({first_line(error)}); copy it again"
+        ) from None
 
 
-def _other_video_facts(path: Path) -> list[tuple[str, str]]:
-    """Facts of a video in another container."""
-    from drocap_ros.perception.sources import open_source
+def _track_fact(stream: Stream, code: str) -> tuple[str, str]:
+    from av.video.codeccontext import VideoCodecContext
 
-    with open_source(path) as video:
-        rate = f", {(video.length - 1) / video.duration_s:.2f}/s" if video.length and video.duration_s else ""
-        count = f", {video.length} frames" if video.length else ""
-        return [("video track", f"{video.size[0]}x{video.size[1]} px{count}{rate}")]
+    context = stream.codec_context
+    kind = "time code" if code == "tmcd" else {"audio": "sound", "subtitle": "subtitles"}.get(stream.type, stream.type)
+    name = _FORMATS.get(code) or (context.codec.name if context else "")
+    words = f"{name} ({_printable(code)})" if name and code else name or _printable(code) or "unknown format"
+    if isinstance(context, VideoCodecContext):
+        words += f", {context.width}x{context.height} px"
+    stamps = [entry.timestamp for entry in stream.index_entries if not entry.is_discard]
+    count = stream.frames and len(stamps)
+    span_s = float((stamps[-1] - stamps[0]) * (stream.time_base or 0)) if count else 0.0
+    words += (f", {count} samples" if count else "") + (f", {(count - 1) / span_s:.2f}/s" if span_s > 0 else "")
+    return f"{kind} track", words
 
 
 def _printable(code: str) -> str:

@@ -154,7 +154,7 @@ def _track(job: _Job) -> str:
         save_tracks(target / name, tracks_from_observations(observations, track_id))
     begin = observations[0].stamp_ns
     changes = [f"{(stamp_ns - begin) * 1e-9:.1f} s: {text}" for stamp_ns, text in estimator.tracker.changes]
-    return "\n".join([_summary(found, len(observations)), *changes[1:], *_overlay_words(drawn.codec)])
+    return "\n".join([_summary(found, len(observations)), *changes[1:]])
 
 
 def _track_people(job: _Job) -> str:
@@ -169,15 +169,7 @@ def _track_people(job: _Job) -> str:
     with drawn if args.overlay else contextlib.nullcontext():
         found = track_people(args.video, config, models, selection, progress, drawn.add if args.overlay else None)
     save_people_tracks(target, found.tracks)
-    return "\n".join([*found.words(), *found.left_out, *_overlay_words(drawn.codec)])
-
-
-def _overlay_words(codec: str) -> list[str]:
-    """A line about the codec where browsers do not play it; no codec = no video."""
-    from drocap_ros.report.video_file import install_words
-
-    plays = not codec or codec == "H.264"
-    return [] if plays else [f"overlay.mp4 is {codec}, which browsers do not play; for H.264 run {install_words()}"]
+    return "\n".join([*found.words(), *found.left_out])
 
 
 def _summary(found: list[tuple[int, int]], frames: int) -> str:

@@ -24,10 +24,8 @@ from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
-from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin
-from drocap_ros.reconstruction.live.latest_place import LatestPlace
-from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
-from drocap_ros.reconstruction.live.stream_order import StreamEvent
+from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin, StreamEvent
+from drocap_ros.reconstruction.live.latest_pose import LatestPlace, LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, EffortControl, TelemetryUse, Window
 from drocap_ros.recording.pose_messages import add_calibration, add_state, fixed_points_from_message, float_array
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode

@@ -1,7 +1,7 @@
 """Node ``initializer``: publishes a first 3D pose of every image.
 
 Subscribes ``pose2d``; publishes ``pose3d/initial`` (drocap_ros/Pose3D, stage INITIAL) in the camera's frame.  Events
-of the stream (:mod:`drocap_ros.reconstruction.live.stream_order`) are counted on ``/diagnostics``.
+of the stream (:mod:`drocap_ros.reconstruction.live.frame_buffer`) are counted on ``/diagnostics``.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import numpy as np
 
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.reconstruction.common.config import InitializerConfig
+from drocap_ros.reconstruction.live.frame_buffer import StreamEvent
 from drocap_ros.reconstruction.live.initializer import LiveInitializer
-from drocap_ros.reconstruction.live.stream_order import StreamEvent
 from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key, of

@@ -22,7 +22,6 @@ from sensor_msgs.msg import CameraInfo
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.flight.mavlink.guardian import GuardianProcess
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.telemetry_request import LinkStatus
@@ -31,7 +30,7 @@ from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.states import Command, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.rivals import Rivals
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle_state import VehicleState, optical_orientation
 from drocap_ros.msg import OrbitStatus, Pose2D
 from drocap_ros.parameters import Values
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode, MessageInfo

@@ -21,8 +21,7 @@ from drocap_ros.ros.conversions import background_to_ros, pose2d_to_ros, stamp_f
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.image_input import ImageInput, ImageSample
 from drocap_ros.ros.lifecycle import ManagedComponent
-from drocap_ros.ros.load_level import LoadShedding
-from drocap_ros.ros.look_ahead import LookAhead
+from drocap_ros.ros.look_ahead import LoadShedding, LookAhead
 from drocap_ros.ros.topics import TOPICS
 
 #: Stands for an image whose subject is known already.

@@ -3,7 +3,7 @@
 Subscribes ``pose2d``, ``pose3d/initial``, ``pose3d/latest`` and ``vehicle/state``; publishes ``markers/keypoints``
 (visualization_msgs/ImageMarker), ``markers/initial``, ``markers/latest`` and ``markers/camera_path``
 (visualization_msgs/MarkerArray) and the joints of the newest pose on TF, those of the latest one where it is in
-``map``.  With ``human_topics`` it also publishes the subject by REP 155, see :mod:`drocap_ros.ros.rep155`.
+``map``.  With ``human_topics`` it also publishes the subject by REP 155, see :mod:`drocap_ros.ros.markers`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,17 @@ from drocap_ros.msg import Pose2D, Pose3D, VehicleState
 from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import MAP, pose3d_from_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
-from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
-from drocap_ros.ros.rep155 import AVAILABLE, MISSING, HumanTopics, human_transforms, prefix_of
+from drocap_ros.ros.markers import (
+    AVAILABLE,
+    MISSING,
+    HumanTopics,
+    body_transforms,
+    human_transforms,
+    keypoint_marker,
+    path_marker,
+    pose_markers,
+    prefix_of,
+)
 from drocap_ros.ros.topics import TFMessage
 from drocap_ros.view.visualizer_config import RateLimit, VisualizerConfig
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.evidence import Evidence
+from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.skeleton import BODY_15, BODY_17, TABLES, JointSet, body_set, joint_map, joint_set_of
 from drocap_ros.tracks import Tracks

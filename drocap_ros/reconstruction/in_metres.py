@@ -11,9 +11,8 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.camera.fusion import with_measured
 from drocap_ros.reconstruction.camera.picture_world import at_assumed_stature, seen_from_camera
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.common.poses import ImagePoses, Progress
+from drocap_ros.reconstruction.common.poses import ImagePoses, Progress, packed
 from drocap_ros.reconstruction.common.refusal import Refusal
-from drocap_ros.reconstruction.common.spread import packed
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
 from drocap_ros.reconstruction.person_view import aside, true_shape

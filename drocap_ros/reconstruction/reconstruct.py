@@ -16,13 +16,13 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.balance import balanced
 from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
-from drocap_ros.reconstruction.camera.cuts import cut_times
 from drocap_ros.reconstruction.camera.fusion import fuse_telemetry, with_causes
+from drocap_ros.reconstruction.camera.kinds import cut_times
 from drocap_ros.reconstruction.camera.picture_world import picture_camera, with_camera
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.engine import blas_threads
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
-from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.heels import with_heels
 from drocap_ros.reconstruction.in_metres import Body, Settings, as_seen, by_place, in_metres
 from drocap_ros.reconstruction.methods import METHODS

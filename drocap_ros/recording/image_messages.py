@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.sources.packets import decoded_packets
 from drocap_ros.perception.sources.pixels import colour_rank, decoded, raw_to_bgr
+from drocap_ros.perception.sources.video import codec_of, decoded_packets
 from drocap_ros.recording.session import IMAGES, Message, Session, TopicInfo, header_stamp_ns
 from drocap_ros.stamps import JUMP_S, NS, StampValidator
 
@@ -105,10 +105,11 @@ def _images(session: Session, chosen: TopicInfo, problems: Counter[str]) -> Iter
     if first is None:
         return
     stamped = itertools.chain((first,), stamped)
-    if not chosen.type_name.endswith(("CompressedVideo", "FFMPEGPacket")):
+    codec = str(getattr(first[1], "encoding", getattr(first[1], "format", "")))
+    video = chosen.type_name.endswith(("CompressedVideo", "FFMPEGPacket"))
+    if not video and (not hasattr(first[1], "format") or codec_of(codec) in (None, "mjpeg")):
         yield from stamped
         return
-    codec = str(getattr(first[1], "encoding", getattr(first[1], "format", "")))
     try:
         yield from decoded_packets(codec, ((stamp_ns, bytes(message.data)) for stamp_ns, message in stamped))
     except InputError as error:

@@ -98,11 +98,6 @@ class OverlayVideo:
         self._first: tuple[int, np.ndarray] | None = None
         self._video: VideoFile | None = None
 
-    @property
-    def codec(self) -> str:
-        """H.264 or MPEG-4; empty before the second frame."""
-        return self._video.codec if self._video else ""
-
     def add(self, frame: Frame, observations: Sequence[PoseObservation]) -> None:
         """Draw everybody in a frame and append it."""
         import cv2

@@ -46,13 +46,13 @@ def save_side_by_side(path: Path, motion: Motion, video: Path, progress: Progres
     Raises
     ------
     InputError
-        When there is no FFmpeg, the motion holds no pose, or the video cannot be used.
+        When the motion holds no pose, or the video cannot be used.
     DrocapError
         When the file cannot be written.
     """
     pictures = _pictures(motion, video, progress)
     first, rate_hz = next(pictures)
-    with VideoFile(path, (first.shape[1], first.shape[0]), rate_hz, require_h264=True) as out:
+    with VideoFile(path, (first.shape[1], first.shape[0]), rate_hz) as out:
         out.write(first)
         for picture, _ in pictures:
             out.write(picture)

@@ -19,7 +19,7 @@ from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.reconstruction.live.latest_place import PlacedPose
+from drocap_ros.reconstruction.live.latest_pose import PlacedPose
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
 from drocap_ros.skeleton import BODY_15, BODY_17, joint_set

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from typing import Generic, ParamSpec, TypeVar
 
 from drocap_ros.errors import NodeError
-from drocap_ros.reconstruction.common.threads import blas_threads
+from drocap_ros.reconstruction.common.engine import blas_threads
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

@@ -13,14 +13,29 @@ from multiprocessing import resource_tracker
 from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 
+import rclpy
 import yaml
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
-from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.own_process import LEAN, environment
 from drocap_ros.ros.spin import node_main
+
+PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_DATA = Path(__file__).parents[1] / "data"
+
+
+def middleware() -> dict[str, str]:
+    """Environment variables by which a process uses our profile of Fast DDS; read when its first node is created."""
+    if PROFILE_VARIABLE in os.environ or not rclpy.get_rmw_implementation_identifier().startswith("rmw_fastrtps"):
+        return {}
+    if os.environ.get(RANGE_VARIABLE) == "LOCALHOST":
+        # The profile restricts the range; ROS's own restriction would add shared memory.
+        return {RANGE_VARIABLE: "SYSTEM_DEFAULT", PROFILE_VARIABLE: str(_DATA / "fastdds_localhost.xml")}
+    return {PROFILE_VARIABLE: str(_DATA / "fastdds.xml")}
+
 
 #: TF has its usual place in this namespace only; another graph has its own, ``NAMESPACE/tf``, since the frames of two
 #: drones have the same names.
@@ -69,7 +84,7 @@ class NodeProcess:
         self._log = context.folder / f"{name}.log"
         parameters = str(context.parameter_file(name, config, restarted))
         arguments = [*context.ros_arguments, *remaps(context.namespace), "--params-file", parameters]
-        variables = context.environment | fastdds.environment()
+        variables = context.environment | middleware()
         # As a daemon it does not survive this process.
         self._process = _FORKSERVER.Process(
             target=_run, name=name, args=(name, arguments, variables, self._log), daemon=True

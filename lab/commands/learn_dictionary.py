@@ -62,7 +62,7 @@ def learn_from_folder(args: argparse.Namespace) -> Dictionary:
 
     from drocap_ros.cli.running import progress_bars
     from drocap_ros.evaluation.truth_files import load_mocap
-    from drocap_ros.reconstruction.common.threads import blas_threads
+    from drocap_ros.reconstruction.common.engine import blas_threads
     from drocap_ros.reconstruction.paper.dictionary import normalize_poses
     from drocap_ros.tracks import read_npz
     from lab.studies.protocol import mocap_files

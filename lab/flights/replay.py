@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.simulation.vehicle.autopilot_control import control_of
 from drocap_ros.simulation.vehicle.dynamics import Body
-from drocap_ros.simulation.vehicle.flight_control import Manner, Target
+from drocap_ros.simulation.vehicle.flight_control import Manner, Target, control_of
 
 STEP_S = 0.01
 FAULT_S = 3.0

@@ -15,8 +15,7 @@ from drocap_ros.evaluation.tables import WORLD_HEAD, markdown_table, world_cells
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.live.latest_place import LatestPlace
-from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
+from drocap_ros.reconstruction.live.latest_pose import LatestPlace, LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct

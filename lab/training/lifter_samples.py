@@ -12,7 +12,8 @@ import numpy as np
 from drocap_ros.contacts import TRUE_REST_M_S
 from drocap_ros.geometry.bones import pair_lengths
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction.lifted.lifter_input import BONES, LIFTER_FPS, normalise
+from drocap_ros.reconstruction.common.windows import LIFTER_FPS
+from drocap_ros.reconstruction.lifted.lifter_input import BONES, normalise
 from drocap_ros.skeleton import BODY_17
 from lab.training.keypoint_errors import as_drawn, detect
 from lab.training.mocap_bank import MocapBank, straighten_legs

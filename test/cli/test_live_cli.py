@@ -20,7 +20,7 @@ from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.recording.open_session import session_info
 from drocap_ros.ros.topics import RESULT_QOS
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES = "/drocap/image/compressed"

@@ -6,12 +6,11 @@ import math
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.observed import Course, Health, Link, Mode, Motion, Observed, Pictures, Subject
 from drocap_ros.flight.orbit.safety import reduce
-from drocap_ros.flight.orbit.states import Action, Command, Limits, SafetyState, State
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.safety_config import SafetyConfig
+from drocap_ros.flight.orbit.states import Action, Command, Idle, Limits, State
 
 LIMITS = Limits(SafetyConfig(commands_enabled=True, mode_change_allowed=True), OrbitConfig())
 #: Parts of an observation and fields of theirs by short names, with which :func:`changed` sets them.
@@ -68,7 +67,7 @@ BRAKE = changed(GOOD, mode="BRAKE", in_control=False, in_hold=True)
 
 
 def orbiting(seen=GOOD):
-    state, _ = reduce(SafetyState(), seen, 0.0, None, LIMITS)
+    state, _ = reduce(Idle(), seen, 0.0, None, LIMITS)
     assert state.state == State.READY
     state, decision = reduce(state, seen, 0.1, Command.START, LIMITS)
     assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)

@@ -21,7 +21,7 @@ from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.ros.conversions import camera_info_to_ros, header_at, stamp_to_ros
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
 from drocap_ros.srv import OrbitCommand
 
 NODES = [

@@ -15,7 +15,7 @@ from rendered_person import rendered_images
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.motion import load_motion
-from drocap_ros.perception.sources.packets import decoded_packets
+from drocap_ros.perception.sources.video import decoded_packets
 from drocap_ros.recording.image_messages import image_from_message, read_images
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.tracks import load_tracks
@@ -184,7 +184,7 @@ def test_foxglove_images_and_videos_are_read(tmp_path, encoding, kind):
     ("codec", "first"), [("hevc_nvenc", b"\0\0\0\x01\x40\x01"), ("libx264", b"\0\0\x01\x67"), ("vvc", b"")]
 )
 def test_codecs_without_a_picture_are_named(codec, first):
-    with pytest.raises(InputError, match="H.265, VP9 or MJPEG" if codec == "vvc" else "expected a"):
+    with pytest.raises(InputError, match="H.265, VP9, AV1 or MJPEG" if codec == "vvc" else "expected a"):
         list(decoded_packets(codec, [(START_NS + i, first + b"\0" * 50) for i in range(3)]))
 
 
@@ -194,6 +194,11 @@ def test_h264_packets_are_read(shared, name):
         frames = list(read_images(session))
     assert len(frames) == 24
     assert {round((b.stamp_ns - a.stamp_ns) * 1e-6) for a, b in itertools.pairwise(frames)} == {67}
+
+
+def test_video_in_compressed_images_is_read(shared):
+    with open_session(shared / "cases" / "bag_h264_in_compressedimage" / "walk") as session:
+        assert len(list(read_images(session))) == 24
 
 
 def test_damaged_messages_end_in_one_line(tmp_path):

@@ -11,7 +11,7 @@ from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose3D
 from drocap_ros.observation import PoseObservation
-from drocap_ros.reconstruction.common.stop_reason import DEADLINE
+from drocap_ros.reconstruction.common.poses import DEADLINE
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, InMap
 from drocap_ros.ros import conversions as c
 from drocap_ros.skeleton import BODY_15

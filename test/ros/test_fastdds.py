@@ -5,8 +5,7 @@ import xml.etree.ElementTree as ET
 import pytest
 import rclpy
 
-from drocap_ros.ros import fastdds
-from drocap_ros.ros.fastdds import PROFILE_VARIABLE, RANGE_VARIABLE
+from drocap_ros.ros.processes import PROFILE_VARIABLE, RANGE_VARIABLE, middleware
 
 pytestmark = pytest.mark.skipif(
     not rclpy.get_rmw_implementation_identifier().startswith("rmw_fastrtps"), reason="another middleware"
@@ -30,14 +29,14 @@ def transports(environment):
 
 
 def test_processes_use_udp_on_every_interface():
-    environment = fastdds.environment()
+    environment = middleware()
     assert transports(environment) == {"UDPv4": []}
     assert RANGE_VARIABLE not in environment
 
 
 def test_localhost_range_stays_on_this_machine_without_shared_memory(monkeypatch):
     monkeypatch.setenv(RANGE_VARIABLE, "LOCALHOST")
-    environment = fastdds.environment()
+    environment = middleware()
     assert transports(environment) == {"UDPv4": ["127.0.0.1"]}
     assert environment[RANGE_VARIABLE] == "SYSTEM_DEFAULT"
 
@@ -46,7 +45,7 @@ def test_the_two_profiles_differ_in_the_addresses_only(monkeypatch):
     texts = []
     for value in ("SUBNET", "LOCALHOST"):
         monkeypatch.setenv(RANGE_VARIABLE, value)
-        root = ET.parse(fastdds.environment()[PROFILE_VARIABLE]).getroot()
+        root = ET.parse(middleware()[PROFILE_VARIABLE]).getroot()
         for descriptor in root.iter(f"{NAME}transport_descriptor"):
             for addresses in descriptor.findall(f"{NAME}interfaceWhiteList"):
                 descriptor.remove(addresses)
@@ -57,4 +56,4 @@ def test_the_two_profiles_differ_in_the_addresses_only(monkeypatch):
 def test_profile_of_the_user_is_left_alone(monkeypatch):
     monkeypatch.setenv(PROFILE_VARIABLE, "/home/me/fastdds.xml")
     monkeypatch.setenv(RANGE_VARIABLE, "LOCALHOST")
-    assert fastdds.environment() == {}
+    assert middleware() == {}

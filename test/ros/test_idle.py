@@ -10,7 +10,7 @@ from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.diagnostics import node_of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
 from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
 NODES = ["pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer", "session_recorder"]
 SILENT = {

@@ -2,7 +2,7 @@
 
 import pytest
 
-from drocap_ros.ros.load_level import LoadShedding
+from drocap_ros.ros.look_ahead import LoadShedding
 
 
 def levels(shedding, queued, step_s=1 / 30, backlog=0):

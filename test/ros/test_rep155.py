@@ -18,7 +18,7 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.nodes import visualizer
 from drocap_ros.observation import PoseObservation
-from drocap_ros.ros import rep155
+from drocap_ros.ros import markers
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import KEPT_QOS, RESULT_QOS, TFMessage
@@ -71,7 +71,7 @@ def turn(q):
 
 def test_frames_place_every_joint_at_its_position(capture):
     joints = capture.joints3d_world[0]
-    body, *links = rep155.human_transforms(pose3d(joints))
+    body, *links = markers.human_transforms(pose3d(joints))
     assert (body.header.frame_id, body.child_frame_id) == ("map", "body_b7")
     place, axes = vector(body.transform.translation), turn(body.transform.rotation)
     np.testing.assert_allclose(place, joints[[BODY_15.index("lhip"), BODY_15.index("rhip")]].mean(0), atol=1e-5)
@@ -79,7 +79,7 @@ def test_frames_place_every_joint_at_its_position(capture):
     for link in links:
         assert link.header.frame_id == "body_b7"
         found[link.child_frame_id] = place + axes @ vector(link.transform.translation)
-    assert set(found) == {f"{link}_b7" for link in rep155.LINKS.values()}
+    assert set(found) == {f"{link}_b7" for link in markers.LINKS.values()}
     np.testing.assert_allclose(found["l_knee_b7"], joints[BODY_15.index("lknee")], atol=1e-5)
     np.testing.assert_allclose(found["head_b7"], joints[BODY_15.index("head")], atol=1e-5)
     # x forward, z towards the head: the left hip lies to the left.
@@ -90,20 +90,20 @@ def test_frames_place_every_joint_at_its_position(capture):
 def test_without_a_trunk_there_is_no_body_frame(capture):
     joints = capture.joints3d_world[0].copy()
     joints[BODY_15.index("neck")] = np.nan
-    assert rep155.human_transforms(pose3d(joints)) == []
-    assert rep155.human_transforms(Pose3D(skeleton="body15")) == []
+    assert markers.human_transforms(pose3d(joints)) == []
+    assert markers.human_transforms(Pose3D(skeleton="body15")) == []
 
 
 def test_keypoints_are_relative_to_the_image_and_none_lies_outside(capture):
     points = np.tile([320.0, 120.0], (15, 1))
     points[BODY_15.index("rwrist")] = (700.0, 100.0)
     points[BODY_15.index("lknee")] = np.nan
-    skeleton = rep155.skeleton2d(observation(points), Header()).skeleton
+    skeleton = markers.skeleton2d(observation(points), Header()).skeleton
     elbow = skeleton[hri.Skeleton2D.RIGHT_ELBOW]
     assert (elbow.x, elbow.y, elbow.c) == pytest.approx((0.5, 0.25, 0.8))
     for code in (hri.Skeleton2D.RIGHT_WRIST, hri.Skeleton2D.LEFT_KNEE, hri.Skeleton2D.NOSE):
         assert skeleton[code].c == 0.0
-    box = rep155.region(observation(points), Header())
+    box = markers.region(observation(points), Header())
     assert (box.xmin, box.ymin, box.xmax, box.ymax) == pytest.approx((0.1, 0.1, 0.5, 1.0))
 
 
@@ -200,7 +200,7 @@ def test_without_hri_msgs_the_frames_remain_and_the_status_names_the_reason(capt
         poses.publish(pose3d(capture.joints3d_world[0]))
         until(lambda: frames)
         assert "body_b7" in {t.child_frame_id for t in frames}
-        assert node._text.endswith(rep155.MISSING)
+        assert node._text.endswith(markers.MISSING)
         assert not node.get_publishers_info_by_topic("/humans/bodies/tracked")
 
 

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.simulation.keypoint_errors import noisy_keypoints, occlusion
 from drocap_ros.simulation.orbit_camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
 from drocap_ros.skeleton import BODY_15

@@ -22,7 +22,7 @@ from drocap_ros.errors import InputError, NodeError
 from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.topics import NODES, TOPICS
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
 from drocap_ros.srv import OrbitCommand
 
 CAPTURE = ["session_player", "initializer", "bundle_adjuster"]

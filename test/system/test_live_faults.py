@@ -12,7 +12,7 @@ from drocap_ros.msg import OrbitStatus, Pose3D, Pose3DWindow
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
 NODES = ["session_player", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
 #: Topic that proves that a node works, the source excepted.

@@ -13,7 +13,7 @@ from drocap_ros.motion import load_motion
 from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import TOPICS
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
 

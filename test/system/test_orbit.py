@@ -16,8 +16,8 @@ from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.transport import open_transport
+from drocap_ros.flight.vehicle_state import camera_rotation
 from drocap_ros.msg import OrbitStatus
 from drocap_ros.observation import PoseObservation
 from drocap_ros.ros.conversions import pose2d_to_ros
@@ -27,7 +27,7 @@ from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
 OTHER_POSE_PUBLISHER, SECOND_BRIDGE = 130, 131  # CONDITION_* of OrbitStatus

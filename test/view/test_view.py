@@ -23,10 +23,8 @@ from drocap_ros.live_replay import replay
 from drocap_ros.motion import Motion, load_motion, save_motion, upright_joints
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
-from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
-from drocap_ros.view.motion_view import draw_motion
+from drocap_ros.view.motion_view import Scene, draw_motion, nominal_camera_matrix, place_cameras
 from drocap_ros.view.rerun_output import new_recording
-from drocap_ros.view.rerun_scene import Scene
 
 pytest.importorskip("rerun", reason="no Rerun viewer here: `make setup` brings it")
 

@@ -148,7 +148,7 @@ def demo_config(folder: Path, seed: int, autopilot: str, models: str, mount: str
 
 def with_link(config: DrocapConfig) -> DrocapConfig:
     """The configuration with a MAVLink link over a free port of this machine."""
-    from drocap_ros.simulation.vehicle.ports import free_udp_port
+    from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
     address = f"127.0.0.1:{free_udp_port()}"
     config = config.replace("flight_simulator", vehicle_url=f"udpout:{address}")

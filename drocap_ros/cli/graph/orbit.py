@@ -95,7 +95,7 @@ def _check_options(args: argparse.Namespace) -> None:
 
 
 def _check_range(name: str, value: float) -> None:
-    from drocap_ros.flight.orbit_config import OrbitConfig
+    from drocap_ros.flight.bridge_config import OrbitConfig
 
     meta = next(spec.metadata for spec in dataclasses.fields(OrbitConfig) if spec.name == _PARAMETERS[name])
     low, high = meta["minimum"], meta["maximum"]

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from drocap_ros.config import DrocapConfig
-    from drocap_ros.flight.preflight.findings import Finding
-    from drocap_ros.flight.preflight.measured import Measured
+    from drocap_ros.flight.preflight.findings import Finding, Measured
     from drocap_ros.flight.preflight.setup_checks import Pictures, Setup
     from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 
@@ -64,7 +63,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Listen, check, print; the status says whether anything is missing."""
     from drocap_ros.config import load_config
-    from drocap_ros.flight.preflight.checks import all_findings, is_ready
+    from drocap_ros.flight.preflight.measure import all_findings, is_ready
 
     if not 2 <= args.seconds <= 300:
         raise InputError(f"--seconds: expected 2 to 300, got {args.seconds:g}; choose another")

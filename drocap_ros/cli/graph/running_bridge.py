@@ -17,7 +17,7 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.orbit.states import State
-from drocap_ros.flight.preflight.measured import Measured, Stream
+from drocap_ros.flight.preflight.findings import Measured, Stream
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.recording.session import Message
 from drocap_ros.ros.diagnostics import Key, number, of, values_of

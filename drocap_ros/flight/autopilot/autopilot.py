@@ -11,13 +11,11 @@ import enum
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, coast_of
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, Setpoint, coast_of
 from drocap_ros.flight.autopilot.simulated import Simulated
 
 
@@ -284,21 +282,6 @@ class Autopilot:
     def coast_of(self, setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, timeout_s: float) -> Coast:
         """Horizontal motion until the vehicle stands, if this setpoint is the last one; see :func:`coast_of`."""
         return coast_of(setpoint, position, velocity, self.coasting, timeout_s)
-
-
-@lru_cache(maxsize=64)
-def greatest_speed(autopilot: Autopilot, timeout_s: float, longest_m: float) -> float:
-    """Greatest speed in m/s at which a level flight straight ahead stops within ``longest_m``."""
-    low, high = 0.0, 20.0
-    while high - low > 0.01:
-        speed = 0.5 * (low + high)
-        velocity, zero = np.array([speed, 0.0, 0.0]), np.zeros(3)
-        last = Setpoint(zero, velocity, zero, 0.0, 0.0)
-        if autopilot.coast_of(last, zero, velocity, timeout_s).length_m > longest_m:
-            high = speed
-        else:
-            low = speed
-    return low
 
 
 #: An autopilot without an instance of its own.

@@ -14,7 +14,26 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+
+class Setpoint(NamedTuple):
+    """Position (3,) m, velocity (3,) m/s and acceleration (3,) m/s^2 in ENU; yaw rad from east, yaw rate rad/s."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    yaw: float
+    yaw_rate: float
+
+    def is_finite(self) -> bool:
+        """Whether it may be sent: NaN as position or yaw has crashed an autopilot."""
+        vectors = np.isfinite(self.position).all() and np.isfinite(self.velocity).all()
+        return bool(vectors and np.isfinite(self.acceleration).all() and np.isfinite([self.yaw, self.yaw_rate]).all())
+
+
+def hold_setpoint(position: np.ndarray, yaw: float) -> Setpoint:
+    """Setpoint that stays at a position."""
+    return Setpoint(position.copy(), np.zeros(3), np.zeros(3), yaw, 0.0)
+
 
 _STEP_S = 0.05  # of the prediction: the period of the setpoints, so that a coast is as fine as what is sent
 _LONGEST_S = 5.0  # of a prediction: every recorded vehicle stood sooner

@@ -18,14 +18,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.commands import TELEMETRY_COMMANDS, Message, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.guardian import PACKETS
-from drocap_ros.flight.mavlink.message import Message
-from drocap_ros.flight.mavlink.messages import TELEMETRY_COMMANDS, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.mount import Mount
 from drocap_ros.flight.mavlink.parser import MavlinkParser, Packer, read_signing_key
-from drocap_ros.flight.mavlink.settings import AutopilotSettings
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
-from drocap_ros.flight.mavlink.telemetry_request import LinkStatus, TelemetryRequests
+from drocap_ros.flight.mavlink.telemetry_request import AutopilotSettings, LinkStatus, TelemetryRequests
 from drocap_ros.flight.mavlink.transport import LinkError, Transport, open_transport
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.stamps import NS

@@ -8,7 +8,7 @@ from collections import deque
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot, autopilot_by_heartbeat
-from drocap_ros.flight.mavlink.message import Message
+from drocap_ros.flight.mavlink.commands import Message
 from drocap_ros.stamps import NS
 
 #: Packets; farther back a sequence number counts as the beginning of a new sequence.

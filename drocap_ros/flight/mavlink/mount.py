@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler, yaw_of
-from drocap_ros.flight.mavlink.message import Message
+from drocap_ros.flight.mavlink.commands import Message
+from drocap_ros.flight.vehicle_state import orientation_to_ros, quaternion_from_euler, yaw_of
 from drocap_ros.geometry.rotations import LENGTH_ERROR, normalized, quaternion_multiply, slerp
 from drocap_ros.stamps import NS
 

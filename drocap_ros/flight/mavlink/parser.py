@@ -9,7 +9,7 @@ from pathlib import Path
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.mavlink.message import Message
+from drocap_ros.flight.mavlink.commands import Message
 
 _EPOCH_NS = 1_420_070_400_000_000_000  # 2015-01-01, from which signing counts in units of 10 us
 _LONGEST_FILE = 1024  # bytes of a key's file that are read: it has 64 digits

@@ -9,12 +9,18 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot
-from drocap_ros.flight.frames import frd_to_flu, ned_to_enu, orientation_to_ros, quaternion_from_euler
 from drocap_ros.flight.mavlink import mount
 from drocap_ros.flight.mavlink.clock_offset import ClockOffset
-from drocap_ros.flight.mavlink.message import Message
+from drocap_ros.flight.mavlink.commands import Message
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS, ModeReports, PacketOrder
-from drocap_ros.flight.vehicle_state import LANDED_ON_GROUND, VehicleState
+from drocap_ros.flight.vehicle_state import (
+    LANDED_ON_GROUND,
+    VehicleState,
+    frd_to_flu,
+    ned_to_enu,
+    orientation_to_ros,
+    quaternion_from_euler,
+)
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.stamps import NS
 

@@ -6,12 +6,16 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-from drocap_ros.flight.bridge_config import FENCE_ROOM_M, MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import (
+    FENCE_ROOM_M,
+    MavlinkBridgeConfig,
+    OrbitGoal,
+    goal_of,
+    height_condition,
+    orbit_condition,
+)
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.states import Command, CommandAnswer, OperatorCommand, SafetyState, State
-from drocap_ros.flight.orbit_config import orbit_condition
-from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
-from drocap_ros.flight.safety_config import height_condition
+from drocap_ros.flight.orbit.states import Command, CommandAnswer, OperatorCommand, Orbiting, Requesting, SafetyState
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.stamps import NS
 
@@ -94,9 +98,9 @@ class CommandDesk:
         self, command: OperatorCommand, state: SafetyState, goal: OrbitGoal, framing: Framing
     ) -> Order | Condition:
         """The order of a valid command, or why the limits forbid what it asks for."""
-        kind, running = Command(command.kind), state.state == State.ORBITING
+        kind, running = Command(command.kind), isinstance(state, Orbiting)
         adjusts = kind == Command.ADJUST
-        if adjusts != running or (state.requesting and not adjusts):
+        if adjusts != running or (isinstance(state, Requesting) and not adjusts):
             return Order(command, kind)  # the state decides, and the goal stays
         wanted = commanded_goal(self._config, command, goal if adjusts else None, framing)
         return wanted if isinstance(wanted, Condition) else Order(command, kind, wanted)

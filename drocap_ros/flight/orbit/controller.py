@@ -12,21 +12,38 @@ import threading
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint, hold_setpoint
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
-from drocap_ros.flight.mavlink.commands import CommandQueue
+from drocap_ros.flight.mavlink.commands import (
+    GIMBAL_PITCH,
+    SET_MODE,
+    CommandQueue,
+    command_message,
+    halt_message,
+    setpoint_message,
+)
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.messages import GIMBAL_PITCH, SET_MODE, command_message, halt_message, setpoint_message
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.command_checks import CommandDesk
 from drocap_ros.flight.orbit.control_status import ControlStatus
-from drocap_ros.flight.orbit.flown_orbit import FlownOrbit
 from drocap_ros.flight.orbit.observer import Observer, OwnFlight
-from drocap_ros.flight.orbit.safety import permit_mode, reduce
-from drocap_ros.flight.orbit.states import Action, Limits, ModeRequest, OperatorCommand, SafetyState, State
+from drocap_ros.flight.orbit.safety import permit_mode, reduce, way_out
+from drocap_ros.flight.orbit.setpoint import FlownOrbit
+from drocap_ros.flight.orbit.states import (
+    Action,
+    Fault,
+    Holding,
+    Idle,
+    Limits,
+    ModeRequest,
+    OperatorCommand,
+    Orbiting,
+    Requesting,
+    SafetyState,
+    State,
+)
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
-from drocap_ros.flight.orbit.way_out import way_out
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.observation import PoseObservation
 
@@ -56,7 +73,7 @@ class OrbitController:
         self._orbit = FlownOrbit(config, self._limits)
         self._queue = CommandQueue()
         self._lock = threading.Lock()
-        self.safety = SafetyState()
+        self.safety: SafetyState = Idle()
         self._fallback: Setpoint | None = None  # what the watchdog holds if this loop hangs
         self._gimbal_s = -math.inf
         #: Another one that commands or is followed, found in the graph; any thread may set it.
@@ -119,7 +136,7 @@ class OrbitController:
         """Whether the watchdog has acted since the last step; a mode that it has requested is no take-over."""
         hung, requested = self._watchdog.take_fired() if self._watchdog else (False, False)
         vehicle = self._observer.vehicle
-        if requested and self.safety.modes and vehicle is not None:
+        if requested and vehicle is not None:
             self.safety = permit_mode(self.safety, autopilot_of(vehicle.autopilot).hold_mode)
         return hung
 
@@ -142,8 +159,8 @@ class OrbitController:
     def _hold_as_watchdog(self) -> None:
         """The watchdog already holds a position: a new one, farther on, would let the vehicle move on."""
         held = self._fallback
-        if held is not None and self.safety.state == State.HOLDING:
-            self.safety = dataclasses.replace(self.safety, hold_position=held.position, hold_yaw=held.yaw)
+        if held is not None and isinstance(self.safety, Holding) and not isinstance(self.safety, Fault):
+            self.safety = dataclasses.replace(self.safety, position=held.position, yaw=held.yaw)
 
     def _on_change(self, seen: Observed) -> None:
         if self.safety.state == State.ORBITING and seen.subject.position is not None:
@@ -158,24 +175,25 @@ class OrbitController:
         if request == ModeRequest.NONE or not autopilot.supported:
             # A request that waits for a visible mode is not sent, but it is not forgotten either: a mode that was
             # granted must not be requested again.
-            holds = self.safety.state in (State.HOLDING, State.FAULT) and not seen.mode.in_hold
-            (self._queue.pause if holds or self.safety.requesting else self._queue.cancel)(SET_MODE)
+            holds = isinstance(self.safety, Holding) and not seen.mode.in_hold
+            waits = holds or isinstance(self.safety, Requesting)
+            (self._queue.pause if waits else self._queue.cancel)(SET_MODE)
             return
         mode = autopilot.hold_mode if request == ModeRequest.HOLD else autopilot.control_mode
         self.safety = permit_mode(self.safety, mode)
         self._queue.request(SET_MODE, autopilot.mode_parameters(mode), f"mode {mode}", now_s)
 
     def _send(self, action: Action, seen: Observed, dt: float) -> Action:
-        mav, target = self._link.mav, self._link.target
+        mav, target, safety = self._link.mav, self._link.target, self.safety
         setpoint: Setpoint | None = None
-        if action == Action.ORBIT:
-            setpoint = self._orbit.setpoint(seen, self.safety, self._observer.framing, dt)
+        if isinstance(safety, Orbiting):
+            setpoint = self._orbit.setpoint(seen, safety, self._observer.framing, dt)
             # A setpoint that stands stays at zero: nothing moves by an estimate alone.
             if setpoint is not None and math.sqrt(setpoint.velocity @ setpoint.velocity) > _STANDING_M_S:
                 # The autopilot's loop compares it with the velocity that it reports, error included.
                 setpoint = setpoint._replace(velocity=setpoint.velocity + seen.vehicle.velocity_offset)
-        elif action == Action.HOLD and self.safety.hold_position is not None:
-            setpoint = hold_setpoint(self.safety.hold_position, self.safety.hold_yaw)
+        elif action == Action.HOLD and isinstance(safety, Requesting | Holding) and safety.position is not None:
+            setpoint = hold_setpoint(safety.position, safety.yaw)
         if setpoint is not None and setpoint.is_finite():
             self._link.send_motion(setpoint_message(mav, target, setpoint))
             return action
@@ -231,7 +249,7 @@ class OrbitController:
         return ControlStatus(
             state=self.safety.state,
             condition=self._orbit.flown_condition(present, seen) if orbiting else present,
-            failed=self.safety.failed,
+            failed=self.safety.failed if isinstance(self.safety, Idle) else None,
             mode_failure=self._queue.failure(SET_MODE),
             way_out=way_out(self.safety, seen, mode_change_allowed=self._config.mode_change_allowed),
             answers=self._desk.take_answers(),

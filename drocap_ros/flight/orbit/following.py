@@ -17,9 +17,9 @@ import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.autopilot.autopilot import Echo
-from drocap_ros.flight.mavlink.message import Message
+from drocap_ros.flight.bridge_config import OrbitConfig
+from drocap_ros.flight.mavlink.commands import Message
 from drocap_ros.flight.orbit.motion_checks import away_limit_m
-from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.vehicle_state import VehicleState
 
 _SENT_S = 0.7  # a setpoint may be echoed for so long at most: two transmissions and the period of the echo

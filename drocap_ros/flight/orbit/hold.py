@@ -1,4 +1,4 @@
-"""The hold: which position is latched, when it retreats from the subject, when the hold mode is requested."""
+"""The hold: which place is latched, when it retreats, when the hold mode is requested, and what is seen meanwhile."""
 
 from __future__ import annotations
 
@@ -7,13 +7,21 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.bridge_config import SafetyConfig
 from drocap_ros.flight.conditions import PICTURE_CODES, Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import subject_located
-from drocap_ros.flight.orbit.sight import UNSEEN_S
-from drocap_ros.flight.orbit.states import Limits, SafetyState, State
-from drocap_ros.flight.safety_config import SafetyConfig
+from drocap_ros.flight.orbit.states import (
+    Commanding,
+    Fault,
+    Holding,
+    Limits,
+    Orbiting,
+    Requesting,
+    SafetyState,
+    Sight,
+)
 
 _AT_REST_M_S = 0.35  # below it a vehicle stands, by a velocity that errs by as much
 _SETTLED_S = 0.3  # slow for so long: a vehicle that springs back is slow for a moment where it turns
@@ -27,12 +35,18 @@ _LEAD_S = 1.5  # of his way, by which a retreat is ahead of one who comes
 _CLEAR_M = 0.3  # of a retreat, beyond min_distance_m
 _MAX_LEAD_M = 3.0  # of the retreat's place from the vehicle: its speed is bounded by it
 _HOLD_MODE_PATIENCE_S = 5.0  # as engage_timeout_s
+#: Telemetry must arrive for so long after a loss before a mode is requested: longer than the 1 s between two
+#: heartbeats, and than packets that were late and arrive after newer ones.
+_STEADY_S = 1.3
+_DEFAULT_TIMEOUT_S = 0.5  # as max_control_timeout_s, where the autopilot reports none
+#: Out of sight for longer, the reported position may have jumped unseen (``vehicle_filter.py``).
+UNSEEN_S = 0.25
 #: Causes that pass by themselves.  A silent link is none of them: motion does not resume because a link returns.
 _HARMLESS = PICTURE_CODES | {ConditionCode.ATTITUDE_OUTDATED, ConditionCode.POSITION_FROZEN}
 
 
 def begin_hold(
-    state: SafetyState,
+    state: Orbiting | Holding,
     reason: Condition,
     seen: Observed,
     now_s: float,
@@ -40,15 +54,15 @@ def begin_hold(
     *,
     blind: bool,
     retreats: bool = False,
-) -> SafetyState:
-    """Enter HOLDING at the present position.
+) -> Holding:
+    """A hold at the present position.
 
     A position that was known a moment ago is extrapolated by the last velocity and held: a position setpoint stops the
     vehicle sooner than velocity zero.
 
     fence_radius_m : no way out leads beyond it
     blind : whether the vehicle's state is not to be trusted
-    retreats : see :class:`SafetyState`
+    retreats : see :class:`Holding`
     """
     vehicle = seen.vehicle
     age_s = max(vehicle.position_age_s, vehicle.age_s)
@@ -56,23 +70,22 @@ def begin_hold(
     fresh = known and max(seen.link.age_s, age_s) <= UNSEEN_S
     place = None
     if known:
-        stood = state.pace.value == 0.0 and reason.code in _HARMLESS
-        place = state.pace.place if stood else _stopping_place(seen, fresh, state.fence_centre, fence_radius_m)
-    return dataclasses.replace(
-        state,
-        state=State.HOLDING,
-        since_s=now_s,
-        condition=reason,
+        if isinstance(state, Orbiting) and state.pace.value == 0.0 and reason.code in _HARMLESS:
+            place = state.pace.place  # it stands there
+        else:
+            place = _stopping_place(seen, fresh, state.fence_centre, fence_radius_m)
+    return Holding(
+        now_s,
+        reason,
+        modes=state.modes,
+        position=place,
+        yaw=vehicle.yaw,
+        fence_centre=state.fence_centre,
         blind=blind and not fresh,
-        hold_mode_s=math.nan if seen.course.followed else now_s,
-        hold_position=place,
-        hold_yaw=vehicle.yaw,
         retreats=retreats,
-        retreated_s=-math.inf,
-        slow_s=math.nan,
-        jumped_s=now_s if seen.jumped else -math.inf,
+        hold_mode_s=None if seen.course.followed else now_s,
         resumable=reason.code in _HARMLESS,
-        clear_s=math.nan,
+        jumped_s=now_s if seen.jumped else -math.inf,
     )
 
 
@@ -122,46 +135,46 @@ def _way_out(seen: Observed) -> np.ndarray:
     return np.append(way * outward + 0.5 * _STOPPING_S * aside, 0.0)
 
 
-def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -> SafetyState:
+def update_hold(state: Holding, seen: Observed, now_s: float, blind: bool) -> Holding:
     """Latch a position that has become known or has jumped, and enter FAULT when the hold mode is not granted.
 
     After a jump of the reported position (a glitch that comes back, a reset of the autopilot's estimator) the latched
     one names another place, and the vehicle would fly there.
     """
     if seen.jumped:  # no place is known, not even the new one: the reports may be two vehicles'
-        state = dataclasses.replace(state, hold_position=None, blind=True, since_s=now_s, jumped_s=now_s)
+        state = dataclasses.replace(state, position=None, blind=True, since_s=now_s, jumped_s=now_s)
     settled = now_s - state.jumped_s > _LEAST_S
     if state.blind and not blind and settled:
-        state = dataclasses.replace(state, blind=False, since_s=now_s, hold_mode_s=math.nan)
-        if state.hold_position is None:
-            state = dataclasses.replace(state, hold_position=seen.vehicle.position.copy(), hold_yaw=seen.vehicle.yaw)
-    late = now_s - state.hold_mode_s > _HOLD_MODE_PATIENCE_S  # NaN: it was not requested
-    if not late or state.state != State.HOLDING or seen.mode.in_hold or not math.isnan(state.lost_s):
+        state = dataclasses.replace(state, blind=False, since_s=now_s, hold_mode_s=None)
+        if state.position is None:
+            state = dataclasses.replace(state, position=seen.vehicle.position.copy(), yaw=seen.vehicle.yaw)
+    late = state.hold_mode_s is not None and now_s - state.hold_mode_s > _HOLD_MODE_PATIENCE_S
+    if not late or isinstance(state, Fault) or seen.mode.in_hold or state.sight.lost:
         return state
     reason = condition(ConditionCode.HOLD_MODE_MISSING, cause=state.condition)
-    return dataclasses.replace(state, state=State.FAULT, since_s=now_s, condition=reason)
+    return Fault(**{**vars(state), "since_s": now_s, "condition": reason})
 
 
 def resumption(
-    state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, config: SafetyConfig
-) -> SafetyState:
+    state: Holding, seen: Observed, now_s: float, problem: Condition | None, config: SafetyConfig
+) -> Holding:
     """Note since when all is clear in a hold that may end by itself; any other cause takes this permission away."""
     if not state.resumable:
         return state
     over = now_s - state.since_s > config.resume_after_hold_s or seen.mode.in_hold or not seen.mode.in_control
     if over or (problem is not None and problem.code not in _HARMLESS):
-        return dataclasses.replace(state, resumable=False, clear_s=math.nan)
+        return dataclasses.replace(state, resumable=False, clear_s=None)
     if problem is not None:
-        return dataclasses.replace(state, clear_s=math.nan)
-    return state if not math.isnan(state.clear_s) else dataclasses.replace(state, clear_s=now_s)
+        return dataclasses.replace(state, clear_s=None)
+    return state if state.clear_s is not None else dataclasses.replace(state, clear_s=now_s)
 
 
-def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
+def retreat(state: Holding, seen: Observed, now_s: float, limits: Limits) -> Holding:
     """Move the hold position away from an approaching subject, at most to the fence, and never nearer to the subject.
 
     Only a subject that is located counts, and only until the autopilot's hold mode has been requested.
     """
-    place, subject, fence, safety = state.hold_position, seen.subject.position, state.fence_centre, limits.safety
+    place, subject, fence, safety = state.position, seen.subject.position, state.fence_centre, limits.safety
     if place is None or subject is None or fence is None or not _may_retreat(state, seen, safety):
         return state
     wanted = limits.orbit.min_distance_m + seen.subject.sd_m + _LEAD_S * max(seen.subject.approach_m_s, 0.0) + _CLEAR_M
@@ -172,27 +185,97 @@ def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) ->
     step = subject[:2] + wanted * outward - here[:2]
     step *= min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
     target = here[:2] + _share_inside(here, step, fence, safety.fence_radius_m) * step
-    return dataclasses.replace(state, hold_position=np.append(target, place[2]), retreated_s=now_s)
+    return dataclasses.replace(state, position=np.append(target, place[2]), retreated_s=now_s)
 
 
-def _may_retreat(state: SafetyState, seen: Observed, safety: SafetyConfig) -> bool:
-    settled = state.blind or not math.isnan(state.hold_mode_s) or seen.mode.in_hold
+def _may_retreat(state: Holding, seen: Observed, safety: SafetyConfig) -> bool:
+    settled = state.blind or state.hold_mode_s is not None or seen.mode.in_hold
     return state.retreats and not settled and subject_located(seen, safety)
 
 
-def request_hold_mode(state: SafetyState, seen: Observed, now_s: float, config: SafetyConfig) -> SafetyState:
+def request_hold_mode(state: Holding, seen: Observed, now_s: float, config: SafetyConfig) -> Holding:
     """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``; not on a lossy link."""
-    if not _awaits_hold_mode(state) or state.blind or seen.link.packet_loss > MAX_LOSS:
+    awaited = not isinstance(state, Fault) and state.hold_mode_s is None and not state.sight.lost
+    if not awaited or state.blind or seen.link.packet_loss > MAX_LOSS:
         return state
     if state.resumable and now_s - state.since_s <= config.resume_after_hold_s:
         return state
     slow = bool(np.linalg.norm(seen.vehicle.velocity) < _AT_REST_M_S)
-    if slow == math.isnan(state.slow_s):
-        state = dataclasses.replace(state, slow_s=now_s if slow else math.nan)
+    if slow == (state.slow_s is None):
+        state = dataclasses.replace(state, slow_s=now_s if slow else None)
     held_s = now_s - max(state.since_s, state.retreated_s)
-    still = now_s - state.slow_s >= _SETTLED_S and held_s > _LEAST_S
-    return dataclasses.replace(state, hold_mode_s=now_s) if still or held_s > config.hold_s else state
+    settled = state.slow_s is not None and now_s - state.slow_s >= _SETTLED_S
+    ready = (settled and held_s > _LEAST_S) or held_s > config.hold_s
+    return dataclasses.replace(state, hold_mode_s=now_s) if ready else state
 
 
-def _awaits_hold_mode(state: SafetyState) -> bool:
-    return state.state == State.HOLDING and math.isnan(state.hold_mode_s) and math.isnan(state.lost_s)
+def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
+    """Note when the vehicle is lost from sight, and when it is in sight again.
+
+    In sight again means that a heartbeat has arrived since the loss: fresh attitude with the mode of before the loss
+    shows nothing of what the pilot has chosen meanwhile.
+    """
+    lost_s, seen_s = state.sight
+    if not _telemetry_fresh(seen, limits):
+        return state if lost_s is not None else dataclasses.replace(state, sight=Sight(now_s, seen_s))
+    if lost_s is None or seen.link.heartbeat_age_s >= now_s - lost_s:
+        return state
+    state = dataclasses.replace(state, sight=Sight(None, now_s))
+    if not isinstance(state, Holding):
+        return state
+    state = dataclasses.replace(state, since_s=now_s, hold_mode_s=None)
+    if now_s - lost_s <= UNSEEN_S:
+        return state
+    # The vehicle is held where it is now, and not led back: setpoints may have ended, or its position been reset.
+    known = bool(np.isfinite(seen.vehicle.position).all()) and seen.health.located
+    return dataclasses.replace(state, position=seen.vehicle.position.copy() if known else None, yaw=seen.vehicle.yaw)
+
+
+def is_silent(state: SafetyState, now_s: float, limits: Limits) -> bool:
+    """Whether the vehicle has been out of sight for so long that nothing is sent any more."""
+    return state.sight.lost_s is not None and now_s - state.sight.lost_s > limits.safety.blind_hold_s
+
+
+def mode_visible(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> bool:
+    """Whether a mode may be requested now: the present one has just been reported, by a link that works both ways.
+
+    The pilot's choice within the age of this report is the only one that a request can override.  Where many packets
+    are lost none is requested: such a link ends orbits, and the pilot takes over just then.
+    """
+    steady = now_s - state.sight.seen_s >= _STEADY_S and not state.sight.lost
+    late = seen.link.round_trip_s > limits.safety.max_round_trip_s  # the request would arrive late too
+    return (
+        steady and not late and seen.link.packet_loss <= MAX_LOSS and seen.link.heartbeat_age_s <= limits.max_mode_age_s
+    )
+
+
+def foreign_mode(state: SafetyState, seen: Observed) -> str:
+    """A mode that was reported and is not ours; "" = none.
+
+    While the operator's request is pending the control mode is ours, whoever restores it: an autopilot may keep it
+    as its intention after a loss, and then the first setpoint is enough.
+    """
+    if not isinstance(state, Commanding) or not state.modes:
+        return ""
+    requested = isinstance(state, Requesting) and seen.mode.in_control
+    own = state.modes | ({seen.mode.name} if requested else frozenset())
+    foreign = (seen.mode.heard | {seen.mode.name}) - own - {""}
+    return seen.mode.name if seen.mode.name in foreign else min(foreign, default="")
+
+
+def stream_ended(seen: Observed) -> bool:
+    """Whether no setpoint was sent for longer than the autopilot's time-out: none may follow by itself.
+
+    A process that was stopped and continues, or a link that returns, would take control back: some autopilots restore
+    their control mode with the first setpoint.
+    """
+    settings = seen.loss_settings
+    timeout_s = math.nan if settings is None else settings.timeout_s
+    return seen.link.stream_gap_s > (_DEFAULT_TIMEOUT_S if math.isnan(timeout_s) else timeout_s)
+
+
+def _telemetry_fresh(seen: Observed, limits: Limits) -> bool:
+    # The attitude's stamp shows packets that arrive late; a heartbeat has no stamp.
+    safety = limits.safety
+    newest = max(seen.link.age_s, seen.vehicle.age_s)
+    return newest <= safety.max_state_age_s and seen.link.heartbeat_age_s <= safety.max_heartbeat_age_s

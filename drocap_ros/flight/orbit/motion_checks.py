@@ -9,18 +9,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import supported_titles
 from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
+from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.flight.observed import FIX_3D, Observed
 from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.safety_config import SafetyConfig
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
 _C = ConditionCode
 REACTION_S = 0.5  # from a step of the subject until the vehicle slows down
 OWN_SPEED_SD_M_S = 0.1  # of the reported velocity
 _LEAST_SUBJECT_AGE_S = 0.25  # the usual age of a picture at 15 Hz, its network included
-_WAITING_LEADS = 1.3  # of max_lead_m, as in planner.advance
+WAITING_LEADS = 1.3  # of max_lead_m: beyond it the reference stands
 _CARRIED_OFF = 3.0  # times that limit: beyond the 3.7 m that vehicles were behind walking subjects
 GUST_S = 1.0  # away for so long: a gust passes
 _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
@@ -192,7 +191,7 @@ def keeping_condition(seen: Observed, limits: Limits, longest_s: float = _LONGES
 
 def away_limit_m(orbit: OrbitConfig) -> float:
     """Distance from its place on the orbit beyond which the reference stands and waits for the vehicle."""
-    return _WAITING_LEADS * orbit.max_lead_m
+    return WAITING_LEADS * orbit.max_lead_m
 
 
 def subject_condition(seen: Observed, limits: Limits, *, patient: bool = False) -> Condition | None:

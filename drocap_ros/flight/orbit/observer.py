@@ -16,11 +16,10 @@ from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.observed import Course, Health, Link, Mode, Motion, Observed, Pictures, SizeSight, Subject
 from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
-from drocap_ros.flight.pose_history import PoseHistory
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
-from drocap_ros.flight.vehicle_filter import Doubt, VehicleFilter
+from drocap_ros.flight.vehicle_filter import Doubt, PoseHistory, VehicleFilter
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.observation import PoseObservation

@@ -13,16 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint
+from drocap_ros.flight.bridge_config import OrbitConfig, OrbitGoal
 from drocap_ros.flight.orbit.motion_checks import REACTION_S
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.orbit_goal import OrbitGoal
+from drocap_ros.flight.orbit.speed import allowed_angular_speed, approach_speed, waiting
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
 _TRIM_RATE = 0.15  # 1/s, about one who stands
 _WALKING_TRIM_RATE = 0.03  # 1/s: the turns of one who walks are no lasting error
 _FLIGHT_ERROR_M = 0.5  # of the flown radius: of the least one, and the most that is trimmed
-_FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
 _CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
 _CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
 _FORWARD_S = 0.5  # s; filter of the centre's acceleration
@@ -130,24 +129,22 @@ def advance(state: OrbitState, goal: OrbitGoal, scene: Scene, dt: float, config:
     centre, centre_velocity, _ = followed
     jerk = config.max_jerk_m_s3
     slow = min(0.5 * config.max_acceleration_m_s2, 1.0)
-    approach = _approach_speed(state, config)
+    outward = np.array([math.cos(state.phase), math.sin(state.phase)])
+    approach = approach_speed(state.radius.value, max(-float(state.centre_velocity @ outward), 0.0), config)
     goal_radius = max(goal.radius_m, config.min_distance_m, min(least_radius_m, config.max_distance_m))
     radius = _toward(state.radius, goal_radius, approach, slow, jerk, dt)
     height = _toward(state.height, ground_m + goal.height_m, config.approach_speed_m_s, slow, jerk, dt)
-    outward = np.array([math.cos(state.phase), math.sin(state.phase)])
     moving = centre_velocity + radius.rate * outward
     along = math.copysign(1.0, goal.angular_speed_rad_s) * np.array([-outward[1], outward[0]])
     greatest = min(greatest_speed_m_s, config.max_speed_m_s)
-    target = _allowed_speed(goal.angular_speed_rad_s, radius.value, moving, along, greatest, config)
+    target = allowed_angular_speed(goal.angular_speed_rad_s, radius.value, moving, along, greatest, config)
     fastest = min(abs(goal.angular_speed_rad_s), greatest / radius.value)
     lead = float(np.linalg.norm(reference_position(state)[:2] - vehicle[:2]))
-    wait = (config.max_lead_m - lead) / ((1 - _FREE_LEAD) * config.max_lead_m)
-    target *= min(max(wait, 0.0), 1.0)
+    waits, creep = waiting(lead, config.max_lead_m)
+    target *= waits
     # A ramp of the wanted length with rounded ends: its greatest rate is 1.5 times its mean.
     rate = 1.5 * max(fastest, math.radians(5.0)) / config.ramp_s
     omega = _speed_toward(state.omega, target, rate, 6.0 * rate / config.ramp_s, dt)
-    # The ramp is too slow for a vehicle that suddenly falls behind: the phase itself waits.
-    creep = min(max((1.3 * config.max_lead_m - lead) / (0.3 * config.max_lead_m), 0.0), 1.0)
     phase = state.phase + 0.5 * (state.omega.value + omega.value) * dt * creep
     if math.hypot(*centre_velocity) > WALKING_M_S:
         phase = _yielding(phase, vehicle[:2] - centre, config.max_lead_m / radius.value)
@@ -227,29 +224,6 @@ def _way(state: OrbitState, vehicle: np.ndarray, longest_m: float) -> np.ndarray
     left = math.sqrt(max(longest_m**2 - float(first @ first), 0.0))
     arc = radius * math.remainder(state.phase - bearing, 2 * math.pi)
     return first + min(max(arc, -left), left) * along
-
-
-def _approach_speed(state: OrbitState, config: OrbitConfig) -> float:
-    """Speed of radius changes: slower behind a subject that walks away, because it may stop at once."""
-    outward = np.array([math.cos(state.phase), math.sin(state.phase)])
-    chase = max(-float(state.centre_velocity @ outward), 0.0)
-    room = max(state.radius.value - config.min_distance_m, 0.0)
-    return min(max(math.sqrt(room) - chase, 0.2), config.approach_speed_m_s)
-
-
-def _allowed_speed(
-    wanted: float, radius: float, moving: np.ndarray, along: np.ndarray, greatest: float, config: OrbitConfig
-) -> float:
-    """Wanted angular speed in rad/s, limited by speed and acceleration at this radius.
-
-    moving : (2,) m/s, what the orbit adds to: of the centre and of the radius
-    along : (2,) direction in which it adds
-    """
-    by_acceleration = math.sqrt(config.max_acceleration_m_s2 / radius)
-    ahead = float(moving @ along)
-    room = greatest**2 - float(moving @ moving) + ahead**2
-    by_speed = max(math.sqrt(max(room, 0.0)) - ahead, 0.0) / radius
-    return math.copysign(min(abs(wanted), by_acceleration, by_speed), wanted)
 
 
 def _follow(

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+
+import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
-from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace
-from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, resumption, retreat, update_hold
+from drocap_ros.flight.orbit.hold import (
+    begin_hold,
+    foreign_mode,
+    is_silent,
+    mode_visible,
+    request_hold_mode,
+    resumption,
+    retreat,
+    stream_ended,
+    update_hold,
+    watch,
+)
 from drocap_ros.flight.orbit.motion_checks import (
     keeping_condition,
     limit_condition,
@@ -17,26 +28,31 @@ from drocap_ros.flight.orbit.motion_checks import (
     subject_condition,
     vehicle_condition,
 )
-from drocap_ros.flight.orbit.sight import foreign_mode, is_lost, is_silent, mode_visible, stream_ended, watch
+from drocap_ros.flight.orbit.speed import allowed_pace, next_pace
 from drocap_ros.flight.orbit.states import (
     Action,
     Command,
     CommandAnswer,
+    Commanding,
     Decision,
+    Fault,
+    Holding,
+    Idle,
     Limits,
     ModeRequest,
+    Orbiting,
     Pace,
+    Ready,
+    Requesting,
     SafetyState,
-    State,
+    TakenOver,
 )
 from drocap_ros.flight.orbit.watchdog import GIVE_UP_S
-from drocap_ros.flight.orbit.way_out import by_hand
 
 _C = ConditionCode
 _BLIND_MODE_REQUEST_S = 2.0  # of velocity zero, from 2.5 m/s at braking_m_s2: a brake by the mode takes longer
 _CLEAR_S = 1.0  # for which all conditions hold before an orbit resumes by itself
 _INTENTION_S = 1.0  # two periods of CURRENT_MODE, which says what is intended
-_ACTIVE = frozenset({State.ORBITING, State.HOLDING, State.FAULT})
 
 
 def reduce(
@@ -54,36 +70,43 @@ def reduce(
     The next state, and what may be sent until the step after it.
     """
     vehicle = vehicle_condition(seen, limits)
-    place = None if vehicle else limit_condition(seen, state.fence_centre, limits)
+    place = None if vehicle else limit_condition(seen, _fence(state), limits)
     problem = vehicle or place or subject_condition(seen, limits) or start_condition(seen)
     state = watch(state, seen, now_s, limits)
-    lost_s, seen_s = state.lost_s, state.seen_s
+    sight = state.sight
     state = _by_mode(state, seen, now_s)
     answer = None
     if command is not None:
         state, answer = _execute(state, seen, now_s, command, problem, limits)
-    if state.state == State.ORBITING:
+    if isinstance(state, Orbiting):
         state = _orbit(state, seen, now_s, vehicle is not None, limits)
-    elif state.requesting:
+    elif isinstance(state, Requesting):
         state = _request(state, seen, now_s, problem, limits)
-    elif state.state in (State.IDLE, State.READY):
+    elif isinstance(state, Idle):
         state = _wait(state, now_s, problem)
-    elif state.state in (State.HOLDING, State.FAULT) and not stream_ended(seen):
+    elif isinstance(state, Holding) and not stream_ended(seen):
         state = update_hold(state, seen, now_s, vehicle is not None)
         state = _hold(state, seen, now_s, problem, limits, astray=bool(vehicle or place))
-    state = dataclasses.replace(state, lost_s=lost_s, seen_s=seen_s)
+    state = dataclasses.replace(state, sight=sight)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
+
+
+def _fence(state: SafetyState) -> np.ndarray | None:
+    """(2,) m, centre of the fence; None = there is none."""
+    return state.fence_centre if isinstance(state, Orbiting | Holding) else None
 
 
 def _by_mode(state: SafetyState, seen: Observed, now_s: float) -> SafetyState:
     """The state that the reported mode leaves; however late it is heard, a mode of somebody else is a take-over."""
     if _returned(state, seen):
-        return _enter(State.IDLE, condition(_C.ALL_CLEAR), now_s)
+        return Idle(now_s, condition(_C.ALL_CLEAR))
     if foreign := foreign_mode(state, seen) or _misjudged(state, seen, now_s):
         return _yield(state, seen, foreign, now_s)
-    if state.state in _ACTIVE and not is_lost(state) and not seen.health.armed and seen.mode.name:
-        return _enter(State.IDLE, condition(_C.DISARMED), now_s)
-    if state.state in _ACTIVE and seen.mode.in_hold:
+    if not isinstance(state, Orbiting | Holding):
+        return state
+    if not state.sight.lost and not seen.health.armed and seen.mode.name:
+        return Idle(now_s, condition(_C.DISARMED))
+    if seen.mode.in_hold:
         # Once the autopilot holds, any other mode is somebody's choice.
         return dataclasses.replace(state, modes=frozenset({seen.mode.name}))
     return state
@@ -92,14 +115,15 @@ def _by_mode(state: SafetyState, seen: Observed, now_s: float) -> SafetyState:
 def _returned(state: SafetyState, seen: Observed) -> bool:
     """Whether the pilot gives control back after our own hold mode: nothing is sent, but a start is enough then."""
     return (
-        state.state == State.HOLDING
+        isinstance(state, Holding)
+        and not isinstance(state, Fault)
         and bool(state.modes)
         and seen.mode.in_control
         and seen.mode.name not in state.modes
     )
 
 
-def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits: Limits) -> SafetyState:
+def _orbit(state: Orbiting, seen: Observed, now_s: float, blind: bool, limits: Limits) -> SafetyState:
     """Slow the orbit down by the age of the data, or end it."""
     problem = _ending(state, seen, limits) or keeping_condition(seen, limits)
     if problem:
@@ -116,13 +140,14 @@ def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits
 
 
 def _hold(
-    state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, limits: Limits, *, astray: bool
+    state: Holding, seen: Observed, now_s: float, problem: Condition | None, limits: Limits, *, astray: bool
 ) -> SafetyState:
     """Retreat, hand over or resume; ``astray``: vehicle or place forbid motion."""
     moved = state if astray else retreat(state, seen, now_s, limits)
     state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
     state = resumption(state, seen, now_s, problem, limits.safety)
-    if state.clear_s <= now_s - _CLEAR_S and seen.mode.in_control and not is_lost(state):
+    clear = state.clear_s is not None and state.clear_s <= now_s - _CLEAR_S
+    if clear and seen.mode.in_control and not state.sight.lost:
         return dataclasses.replace(_begin_orbit(seen, now_s), fence_centre=state.fence_centre)
     return state
 
@@ -130,27 +155,25 @@ def _hold(
 def _ending(state: SafetyState, seen: Observed, limits: Limits) -> Condition | None:
     """Why an orbit that is flown or requested must end; gaps of the data end it later than they forbid its start."""
     vehicle = vehicle_condition(seen, limits, patient=True)
-    place = None if vehicle else limit_condition(seen, state.fence_centre, limits)
+    place = None if vehicle else limit_condition(seen, _fence(state), limits)
     return vehicle or place or subject_condition(seen, limits, patient=True)
 
 
 def _yield(state: SafetyState, seen: Observed, mode: str, now_s: float) -> SafetyState:
     """End all commands: the mode is not ours."""
     if not (seen.mode.left_by_itself and mode == seen.mode.name):
-        return _enter(State.TAKEN_OVER, condition(_C.PILOT_TOOK_OVER, mode=mode), now_s)
+        return TakenOver(now_s, condition(_C.PILOT_TOOK_OVER, mode=mode))
     evidence = f"the autopilot has left its control mode for {mode} by itself, as where setpoints do not arrive"
     reason = seen.disturbance or condition(_C.SETPOINTS_NOT_FOLLOWED, evidence=evidence)
     if not seen.mode.in_hold:
-        return _enter(State.TAKEN_OVER, reason, now_s)
+        return TakenOver(now_s, reason)
     # Its hold is the one in which a stop ends; nothing is sent in it.
-    if state.state in (State.HOLDING, State.FAULT):
-        reason = state.condition
-    return _enter(State.HOLDING, reason, now_s, modes=frozenset({mode}))
+    return Holding(now_s, state.condition if isinstance(state, Holding) else reason, modes=frozenset({mode}))
 
 
 def _misjudged(state: SafetyState, seen: Observed, now_s: float) -> str:
     """The mode that was taken for the pilot's because a heartbeat came before the report of what is intended."""
-    taken = state.state == State.TAKEN_OVER and state.condition.code == _C.PILOT_TOOK_OVER
+    taken = isinstance(state, TakenOver) and state.condition.code == _C.PILOT_TOOK_OVER
     if taken and seen.mode.left_by_itself and now_s - state.since_s < _INTENTION_S:
         return seen.mode.name if state.condition.values.get("mode") == seen.mode.name else ""
     return ""
@@ -158,52 +181,46 @@ def _misjudged(state: SafetyState, seen: Observed, now_s: float) -> str:
 
 def permit_mode(state: SafetyState, mode: str) -> SafetyState:
     """Note that the bridge has requested this mode: its arrival is no take-over."""
-    return dataclasses.replace(state, modes=state.modes | {mode}) if state.modes else state
+    if not isinstance(state, Commanding) or not state.modes:
+        return state
+    return dataclasses.replace(state, modes=state.modes | {mode})
 
 
 def _execute(
     state: SafetyState, seen: Observed, now_s: float, command: Command, problem: Condition | None, limits: Limits
 ) -> tuple[SafetyState, CommandAnswer]:
-    state = dataclasses.replace(state, failed=None)
+    state = dataclasses.replace(state, failed=None) if isinstance(state, Idle) else state
     if command == Command.STOP:
         return _stop(state, seen, now_s, limits)
     if command == Command.ADJUST:
-        if state.state == State.ORBITING:
+        if isinstance(state, Orbiting):
             return state, _accepted(_C.ADJUSTED)
         return state, _refused(_C.NO_ORBIT_TO_ADJUST, state=state.state.name.lower())
-    if state.state == State.ORBITING:
+    if isinstance(state, Orbiting):
         return state, _accepted(_C.ALREADY_ORBITING)
     if (refused := _start_refusal(state, seen, problem)) is not None:
         return state, refused
-    if state.requesting:
+    if isinstance(state, Requesting):
         return state, _accepted(_C.ALREADY_REQUESTING_CONTROL)
     if seen.mode.in_control:
         return _begin_orbit(seen, now_s), _accepted(_C.ORBITING)
     if (refused := _request_refusal(seen, command, limits)) is not None:
         return state, refused
     answer = _accepted(_C.REQUESTING_CONTROL)
-    state = _enter(
-        State.READY,
-        answer.condition,
-        now_s,
-        modes=frozenset({seen.mode.name}),
-        requesting_s=now_s,
-        hold_position=seen.vehicle.position.copy(),
-        hold_yaw=seen.vehicle.yaw,
-    )
-    return state, answer
+    place, modes = seen.vehicle.position.copy(), frozenset({seen.mode.name})
+    return Requesting(now_s, answer.condition, modes=modes, position=place, yaw=seen.vehicle.yaw), answer
 
 
 def _start_refusal(state: SafetyState, seen: Observed, problem: Condition | None) -> CommandAnswer | None:
     """Why no orbit may begin by a command."""
-    if state.state == State.TAKEN_OVER:
+    if isinstance(state, TakenOver):
         return _refused(_C.PILOT_IN_COMMAND)
-    if state.state == State.FAULT:
+    if isinstance(state, Fault):
         return _refused(_C.FAULT_NOT_ACKNOWLEDGED, cause=state.condition)
     if problem:
         return CommandAnswer(False, problem)
-    pending = seen.mode.in_control and state.modes > {seen.mode.name} and not math.isnan(state.hold_mode_s)
-    if pending and not state.requesting:
+    pending = isinstance(state, Holding) and state.hold_mode_s is not None and state.modes > {seen.mode.name}
+    if pending and seen.mode.in_control:
         # The hold mode has been requested: it would arrive during the orbit, and count as the pilot's.
         return _refused(_C.HOLD_MODE_PENDING, by_hand=by_hand(seen))
     return None
@@ -222,43 +239,38 @@ def _request_refusal(seen: Observed, command: Command, limits: Limits) -> Comman
 
 
 def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[SafetyState, CommandAnswer]:
-    if state.state == State.ORBITING or (state.state == State.HOLDING and state.retreats):
+    if isinstance(state, Orbiting) or (isinstance(state, Holding) and state.retreats and not isinstance(state, Fault)):
         answer = _accepted(_C.STOPPED)
         blind = vehicle_condition(seen, limits) is not None
         return begin_hold(state, answer.condition, seen, now_s, limits.safety.fence_radius_m, blind=blind), answer
-    if state.state in (State.TAKEN_OVER, State.FAULT):
-        answer = _accepted(_C.ACKNOWLEDGED)
-        return _enter(State.IDLE, answer.condition, now_s), answer
-    if state.requesting:
-        answer = _accepted(_C.STOPPED)
-        return _enter(State.IDLE, answer.condition, now_s), answer
-    if state.state == State.HOLDING:
+    if isinstance(state, TakenOver | Fault | Requesting):
+        answer = _accepted(_C.STOPPED if isinstance(state, Requesting) else _C.ACKNOWLEDGED)
+        return Idle(now_s, answer.condition), answer
+    if isinstance(state, Holding):
         return dataclasses.replace(state, resumable=False), _accepted(_C.ALREADY_HOLDING)
     return state, _accepted(_C.NOT_ORBITING)
 
 
-def _request(
-    state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, limits: Limits
-) -> SafetyState:
+def _request(state: Requesting, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
     """While control is requested; a short gap of the data delays the orbit."""
     cause = _ending(state, seen, limits)
     if cause is None:
         if seen.mode.in_control and not problem:
             return _begin_orbit(seen, now_s)
-        if now_s - state.requesting_s <= limits.safety.engage_timeout_s + limits.warm_up_s:
+        if now_s - state.since_s <= limits.safety.engage_timeout_s + limits.warm_up_s:
             return state
         cause = problem if seen.mode.in_control else None  # with the mode granted, it has delayed the orbit so long
     failed = condition(_C.REQUEST_ENDED, cause=cause) if cause else _not_granted(seen)
-    return _enter(State.IDLE if problem else State.READY, failed, now_s, failed=failed)
+    return (Idle if problem else Ready)(now_s, failed, failed=failed)
 
 
-def _wait(state: SafetyState, now_s: float, problem: Condition | None) -> SafetyState:
+def _wait(state: Idle, now_s: float, problem: Condition | None) -> SafetyState:
     """Idle and ready."""
     reason = problem or state.failed or condition(_C.ALL_CLEAR)
-    wanted = State.IDLE if problem else State.READY
-    if (state.state, state.condition) == (wanted, reason):
+    wanted = Idle if problem else Ready
+    if (type(state), state.condition) == (wanted, reason):
         return state
-    return _enter(wanted, reason, now_s, failed=state.failed)
+    return wanted(now_s, reason, failed=state.failed)
 
 
 def _not_granted(seen: Observed) -> Condition:
@@ -269,46 +281,34 @@ def _not_granted(seen: Observed) -> Condition:
 
 
 def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:
-    if state.state == State.ORBITING:
+    if isinstance(state, Orbiting):
         return Action.ORBIT, ModeRequest.NONE
-    if state.state == State.READY and state.requesting:
+    if isinstance(state, Requesting):
         # Where the autopilot still intends the control mode, setpoints alone end the failsafe for their loss.  A
         # request would end any other failsafe, too: the autopilot takes it for a pilot who takes over.
-        own_loss, warm = seen.mode.left_by_itself, now_s - state.requesting_s >= limits.warm_up_s
+        own_loss, warm = seen.mode.left_by_itself, now_s - state.since_s >= limits.warm_up_s
         wanted = warm and not own_loss and start_condition(seen) is None and mode_visible(state, seen, now_s, limits)
         return Action.HOLD, ModeRequest.CONTROL if wanted else ModeRequest.NONE
     silent = not seen.mode.in_control or is_silent(state, now_s, limits) or stream_ended(seen)
-    if state.state in (State.HOLDING, State.FAULT) and not silent:
+    if isinstance(state, Holding) and not silent:
         return _permitted_in_hold(state, seen, now_s, limits)
     return Action.NOTHING, ModeRequest.NONE
 
 
-def _permitted_in_hold(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:
-    action, since = Action.HALT if state.hold_position is None else Action.HOLD, now_s - state.since_s
+def _permitted_in_hold(state: Holding, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:
+    action, since = Action.HALT if state.position is None else Action.HOLD, now_s - state.since_s
     if state.blind and since >= GIVE_UP_S:
         action = Action.NOTHING
     # Not at once: the autopilot's brake takes longer than velocity zero.  And not without a visible mode: the pilot
     # may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
-    wanted = since > _BLIND_MODE_REQUEST_S if state.blind else not math.isnan(state.hold_mode_s)
+    wanted = since > _BLIND_MODE_REQUEST_S if state.blind else state.hold_mode_s is not None
     return action, ModeRequest.HOLD if wanted and mode_visible(state, seen, now_s, limits) else ModeRequest.NONE
 
 
-def _begin_orbit(seen: Observed, now_s: float) -> SafetyState:
+def _begin_orbit(seen: Observed, now_s: float) -> Orbiting:
     assert seen.subject.position is not None
-    return _enter(
-        State.ORBITING,
-        condition(_C.ORBITING),
-        now_s,
-        modes=frozenset({seen.mode.name}),
-        fence_centre=seen.subject.position[:2].copy(),
-        hold_position=seen.vehicle.position.copy(),
-        hold_yaw=seen.vehicle.yaw,
-        pace=Pace(at_s=now_s),
-    )
-
-
-def _enter(state: State, reason: Condition, now_s: float, **values: object) -> SafetyState:
-    return SafetyState(state=state, since_s=now_s, condition=reason, **values)  # type: ignore[arg-type]
+    centre, modes = seen.subject.position[:2].copy(), frozenset({seen.mode.name})
+    return Orbiting(now_s, condition(_C.ORBITING), modes=modes, fence_centre=centre, pace=Pace(at_s=now_s))
 
 
 def _accepted(code: ConditionCode) -> CommandAnswer:
@@ -317,3 +317,23 @@ def _accepted(code: ConditionCode) -> CommandAnswer:
 
 def _refused(code: ConditionCode, **values: object) -> CommandAnswer:
     return CommandAnswer(False, condition(code, **values))
+
+
+def by_hand(seen: Observed) -> str:
+    """How the pilot enters the control mode, as the end of a sentence."""
+    return f", or {seen.autopilot.hints.by_hand}" if seen.autopilot.hints.by_hand else ""
+
+
+def way_out(state: SafetyState, seen: Observed, *, mode_change_allowed: bool) -> str:
+    """What the operator may do next, as a sentence; "" = nothing leads out, or the condition says it."""
+    if isinstance(state, TakenOver | Fault):
+        return "`drocap orbit stop` acknowledges it, and nothing begins before"
+    if not isinstance(state, Ready | Holding):
+        return ""
+    if not seen.mode.in_control:
+        hand = by_hand(seen).removeprefix(", or ")
+        if mode_change_allowed:
+            return f"`drocap orbit engage` requests control and begins an orbit{by_hand(seen)}"
+        return f"{hand}, then `drocap orbit start`" if hand else "engage needs mode_change_allowed"
+    silent = isinstance(state, Holding) and stream_ended(seen)
+    return ("nothing is sent any more; " if silent else "") + "`drocap orbit start` begins an orbit"

@@ -1,17 +1,16 @@
-"""Types of the orbit's state machine: its states, the operator's commands, what may be sent."""
+"""Types of the orbit's state machine: one for each state, the operator's commands, what may be sent."""
 
 from __future__ import annotations
 
 import enum
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.safety_config import SafetyConfig
 
 
 class State(enum.IntEnum):
@@ -81,51 +80,35 @@ class Pace(NamedTuple):
     place: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
-class SafetyState:
-    """State of the machine.
+class Sight(NamedTuple):
+    """Whether the vehicle is in sight, by fresh telemetry.
 
-    since_s : of the state
-    condition : why it is in the state
-    pace : of the orbit; below 1 while it is degraded
-    hold_position, hold_yaw : latched
-    retreats : whether the hold position moves away from an approaching subject: only where nothing but nearness
-        ended the orbit
-    retreated_s : when it last did
-    slow_s : since when the vehicle has been slow during the hold; NaN = it is not
-    fence_centre : (2,) where the orbit began
-    modes : modes that are no take-over at present; empty = any
-    requesting_s : since when control is requested; NaN = it is not
-    failed : why the last request of control ended without an orbit, until the next command; None = it did not
-    hold_mode_s : when the hold mode was first requested; NaN = not yet
-    blind : whether the hold began without a trustworthy vehicle state
-    resumable : whether the orbit may resume by itself: a harmless cause alone began the hold
-    jumped_s : when the reported position has jumped last in this hold
-    clear_s : since when all conditions hold again in such a hold; NaN = they do not
-    lost_s : since when the vehicle is out of sight (no fresh telemetry); NaN = it is in sight
-    seen_s : since when it is in sight without interruption; -infinity = it was never lost
+    lost_s : since when it is not; None = it is
+    seen_s : since when it is, without interruption; -infinity = it was never lost
     """
 
-    state: State = State.IDLE
+    lost_s: float | None = None
+    seen_s: float = -math.inf
+
+    @property
+    def lost(self) -> bool:
+        """Whether the vehicle is out of sight."""
+        return self.lost_s is not None
+
+
+@dataclass(frozen=True)
+class SafetyState:
+    """A state of the machine; each has a type with what it needs.
+
+    since_s : monotonic
+    condition : why the machine is in it
+    """
+
+    state: ClassVar[State]
+
     since_s: float = 0.0
     condition: Condition = field(default_factory=lambda: condition(ConditionCode.NO_DATA))
-    pace: Pace = field(default_factory=Pace)
-    hold_position: np.ndarray | None = None
-    hold_yaw: float = math.nan
-    retreats: bool = False
-    retreated_s: float = -math.inf
-    slow_s: float = math.nan
-    fence_centre: np.ndarray | None = None
-    modes: frozenset[str] = frozenset()
-    requesting_s: float = math.nan
-    failed: Condition | None = None
-    hold_mode_s: float = math.nan
-    blind: bool = False
-    resumable: bool = False
-    jumped_s: float = -math.inf
-    clear_s: float = math.nan
-    lost_s: float = math.nan
-    seen_s: float = -math.inf
+    sight: Sight = field(default_factory=Sight)
 
     @property
     def reason(self) -> str:
@@ -133,14 +116,103 @@ class SafetyState:
         return str(self.condition)
 
     @property
-    def requesting(self) -> bool:
-        """Whether control is being requested from the autopilot."""
-        return not math.isnan(self.requesting_s)
-
-    @property
     def bound(self) -> bool:
         """Whether the vehicle flies, or may soon fly by itself, by the present subject: no other may replace it."""
-        return self.state == State.ORBITING or self.requesting or self.resumable
+        return isinstance(self, Orbiting | Requesting) or (isinstance(self, Holding) and self.resumable)
+
+
+@dataclass(frozen=True)
+class Idle(SafetyState):
+    """Something forbids motion.
+
+    failed : why the last request of control ended without an orbit, until the next command; None = it did not
+    """
+
+    state = State.IDLE
+    failed: Condition | None = None
+
+
+@dataclass(frozen=True)
+class Ready(Idle):
+    """All conditions for motion hold."""
+
+    state = State.READY
+
+
+@dataclass(frozen=True)
+class TakenOver(SafetyState):
+    """The pilot, or a failsafe of the autopilot, has taken over: nothing is sent."""
+
+    state = State.TAKEN_OVER
+
+
+@dataclass(frozen=True)
+class Commanding(SafetyState):
+    """States in which the vehicle is, or was, commanded.
+
+    modes : that are no take-over at present; empty = any
+    """
+
+    modes: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Requesting(Commanding):
+    """Control is requested from the autopilot, at a place (3,) m and a yaw that are held meanwhile."""
+
+    state = State.READY
+    position: np.ndarray | None = None
+    yaw: float = math.nan
+
+
+@dataclass(frozen=True)
+class Orbiting(Commanding):
+    """The orbit is flown.
+
+    fence_centre : (2,) m, where it began
+    pace : below 1 while it is degraded
+    """
+
+    state = State.ORBITING
+    fence_centre: np.ndarray | None = None
+    pace: Pace = field(default_factory=Pace)
+
+
+@dataclass(frozen=True)
+class Holding(Commanding):
+    """An active hold at a place.
+
+    position, yaw : latched; None = no place is known
+    fence_centre : of the orbit before; None = there was none
+    blind : whether the hold began without a trustworthy vehicle state
+    retreats : whether the place moves away from an approaching subject: only where nothing but nearness ended the orbit
+    retreated_s : when it last did
+    slow_s : since when the vehicle has been slow; None = it is not
+    hold_mode_s : when the autopilot's hold mode was first requested; None = not yet
+    resumable : whether the orbit may resume by itself: a harmless cause alone began the hold
+    jumped_s : when the reported position has jumped last
+    clear_s : since when all conditions hold again where it is resumable; None = they do not
+    """
+
+    state = State.HOLDING
+    position: np.ndarray | None = None
+    yaw: float = math.nan
+    fence_centre: np.ndarray | None = None
+    blind: bool = False
+    retreats: bool = False
+    retreated_s: float = -math.inf
+    slow_s: float | None = None
+    hold_mode_s: float | None = None
+    resumable: bool = False
+    jumped_s: float = -math.inf
+    clear_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Fault(Holding):
+    """A hold whose mode the autopilot does not enter."""
+
+    state = State.FAULT
 
 
 @dataclass(frozen=True)

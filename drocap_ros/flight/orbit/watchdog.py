@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import NamedTuple
 
-from drocap_ros.flight.mavlink.message import Message
+from drocap_ros.flight.mavlink.commands import Message
 
 _PERIOD_S = 0.1  # between setpoints: five within the autopilot's time-out of 0.5 s
 _CHECK_S = 0.02  # between looks at the loop: a tenth of watchdog_s

@@ -12,8 +12,7 @@ from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
-from drocap_ros.flight.preflight.findings import Finding, Verdict, check, graded
-from drocap_ros.flight.preflight.measured import Measured, Stream
+from drocap_ros.flight.preflight.findings import Finding, Measured, Stream, Verdict, check, graded
 
 _C = ConditionCode
 _ENOUGH = 0.8  # share of a wanted rate: autopilots round intervals to their own loops

@@ -10,10 +10,9 @@ import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.autopilot.autopilot import Level
-from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig, goal_of
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.observed import Motion
-from drocap_ros.flight.orbit_goal import goal_of
 from drocap_ros.flight.preflight.findings import Finding, Values, Verdict, check, graded
 from drocap_ros.flight.subject.framing import Framing, View, orbit_margin
 from drocap_ros.flight.vehicle_state import VehicleState

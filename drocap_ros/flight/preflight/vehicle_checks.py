@@ -10,8 +10,7 @@ from drocap_ros.flight.autopilot.autopilot import FenceSettings, FlownSpeeds, Le
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.motion_checks import LANDED_STATES, battery_condition, loss_condition
-from drocap_ros.flight.preflight.findings import Finding, Values, Verdict, check, graded
-from drocap_ros.flight.preflight.measured import LASTING, Measured, Stream
+from drocap_ros.flight.preflight.findings import LASTING, Finding, Measured, Stream, Values, Verdict, check, graded
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, SATELLITES_UNKNOWN, VehicleState
 
 _C = ConditionCode

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.flight.pose_history import CameraPose
-from drocap_ros.flight.subject.parallax import Parallax
+from drocap_ros.flight.bridge_config import SubjectConfig
+from drocap_ros.flight.subject.guard import Parallax
 from drocap_ros.flight.subject.subject_measurement import MAX_BENDING, SubjectMeasurement, locate_subject
-from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.flight.vehicle_filter import CameraPose
 from drocap_ros.observation import PoseObservation
 from drocap_ros.stamps import NS
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.pose_history import CameraPose
-from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.flight.bridge_config import SubjectConfig
+from drocap_ros.flight.vehicle_filter import CameraPose
 from drocap_ros.observation import PoseObservation
 from drocap_ros.skeleton import BODY_15, joint_map
 

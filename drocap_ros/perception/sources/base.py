@@ -33,6 +33,7 @@ class SourceEventKind(Enum):
     RECONNECTING = "reconnecting"
     RECOVERED = "recovered"
     ENDED_EARLY = "ended_early"
+    DAMAGED = "damaged"
     NO_TIMES = "no_presentation_times"
 
 

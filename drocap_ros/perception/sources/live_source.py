@@ -2,36 +2,46 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from drocap_ros.errors import InputError
+import numpy as np
+
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.perception.sources.pixels import to_bgr
-from drocap_ros.perception.sources.video import ffmpeg_options, quiet_ffmpeg
+from drocap_ros.perception.sources.video import Decoder, pyav
 
 if TYPE_CHECKING:
     import cv2
+    from av.container import InputContainer
+
+#: Presentation times in ns, where known, and images; closing it releases the device.
+Images = Generator[tuple["int | None", np.ndarray], None, None]
 
 log = logging.getLogger(__name__)
 
 #: First pause before the next attempt to connect; it doubles up to ``reconnect_max_s``.
 _FIRST_BACKOFF_S = 0.25
-#: Longest wait for the first image: FFmpeg's own time-out of 8 s (below) and the first key frame.
+#: Longest wait for an answer, and for the first image: the answer and the first key frame.
+_ANSWER_TIMEOUT_S = 8.0
 _OPEN_TIMEOUT_S = 12.0
 #: Largest relative drift of a slower stream clock; crystals are accurate to 50 ppm.
 _DRIFT = 2e-4
 #: Beyond this the system clock was set; less is a pause between two readings of the clocks.
 _SET_NS = 100_000_000
 
-_STREAM_OPTIONS = (
-    "rtsp_transport;tcp|fflags;nobuffer"
-    "|protocol_whitelist;file,pipe,rtp,udp,tcp,http,https,tls,rtsp,rtsps,srt,rtmp,crypto"
-)
+_STREAM_OPTIONS = {
+    "rtsp_transport": "tcp",
+    "fflags": "nobuffer",
+    "protocol_whitelist": "file,pipe,rtp,udp,tcp,http,https,tls,rtsp,rtsps,srt,rtmp,crypto",
+}
 
 
 class StreamClock:
@@ -80,13 +90,13 @@ class LiveSource(ImageSource):
     Parameters
     ----------
     name : in messages
-    connect : opens an OpenCV capture, or raises InputError
+    connect : opens the device, or raises InputError
     config : stall time-out and longest reconnection pause
     """
 
     live = True
 
-    def __init__(self, name: str, connect: Callable[[], cv2.VideoCapture], config: ImageIngestConfig) -> None:
+    def __init__(self, name: str, connect: Callable[[], Images], config: ImageIngestConfig) -> None:
         super().__init__()
         self.name = name
         self._connect = connect
@@ -147,14 +157,14 @@ class LiveSource(ImageSource):
         pause = _FIRST_BACKOFF_S
         while not self._closed:
             try:
-                capture = self._connect()
+                arriving = self._connect()
             except InputError as error:
                 if self._received == 0:
                     self._fail(str(error))
                     return
             else:
-                images = self._drain(capture)
-                capture.release()
+                images = self._drain(arriving)
+                arriving.close()
                 if images:
                     pause = _FIRST_BACKOFF_S
                 elif self._received == 0:
@@ -173,18 +183,15 @@ class LiveSource(ImageSource):
             self._error = why
             self._condition.notify_all()
 
-    def _drain(self, capture: cv2.VideoCapture) -> int:
+    def _drain(self, arriving: Images) -> int:
         """Read until the connection ends; returns the number of images."""
-        import cv2
-
         clock = StreamClock()
         images = 0
-        while not self._closed:
-            ok, image = capture.read()
-            if not ok or image is None:
+        for position_ns, image in arriving:
+            if self._closed:
                 break
-            position_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            stamp = clock.stamp(position_ns, time.time_ns(), time.monotonic_ns())
+            steady_ns = time.monotonic_ns()
+            stamp = clock.stamp(steady_ns if position_ns is None else position_ns, time.time_ns(), steady_ns)
             images += 1
             self._last_arrival = time.monotonic()
             if self._stalled:
@@ -192,18 +199,22 @@ class LiveSource(ImageSource):
                 self._event(SourceEventKind.RECOVERED, "images arrive again")
             with self._condition:
                 self._received += 1
-                self._newest = Frame(stamp, to_bgr(image))
+                self._newest = Frame(stamp, image)
                 self._condition.notify_all()
         return images
 
 
 def open_camera(index: int, config: ImageIngestConfig) -> LiveSource:
-    """V4L2 camera ``/dev/videoN``; its stamps are the driver's buffer times."""
+    """V4L2 camera ``/dev/videoN``; its stamps are the driver's buffer times.
 
-    def connect() -> cv2.VideoCapture:
+    OpenCV reads it: PyAV's wheels hold no V4L2.
+    """
+
+    def connect() -> Images:
         import cv2
 
-        quiet_ffmpeg()
+        if hasattr(cv2.utils, "logging"):  # drocap reports each failure once
+            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         capture = cv2.VideoCapture(index, cv2.CAP_V4L2)
         if not capture.isOpened():
             raise InputError(f"/dev/video{index}: expected a V4L2 camera, none could be opened")
@@ -215,27 +226,43 @@ def open_camera(index: int, config: ImageIngestConfig) -> LiveSource:
         for key, value in requested.items():
             if value:
                 capture.set(key, value)
-        return capture
+        return _captured(capture)
+
+    def _captured(capture: cv2.VideoCapture) -> Images:
+        import cv2
+
+        try:
+            while (read := capture.read())[0]:
+                yield round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6), to_bgr(np.asarray(read[1]))
+        finally:
+            capture.release()
 
     return LiveSource(f"/dev/video{index}", connect, config)
 
 
 def open_stream(url: str, config: ImageIngestConfig) -> LiveSource:
-    """RTSP (over TCP), UDP or HTTP stream, a named pipe, or an ``.sdp`` file that describes an RTP stream.
+    """RTSP (over TCP), UDP or HTTP stream, a named pipe, or an ``.sdp`` file that describes an RTP stream."""
 
-    ``OPENCV_FFMPEG_CAPTURE_OPTIONS`` of the environment replaces the options for FFmpeg.
-    """
+    def connect() -> Images:
+        av = pyav()
+        wait_s = max(1.0, 2 * config.stall_timeout_s)
+        try:
+            container = av.open(
+                url, options=_STREAM_OPTIONS, timeout=(_ANSWER_TIMEOUT_S, wait_s), metadata_errors="replace"
+            )
+        except av.error.FFmpegError as error:
+            raise InputError(f"FFmpeg found no stream there ({first_line(error)})") from None
+        return _decoded(container)
 
-    def connect() -> cv2.VideoCapture:
-        import cv2
-
-        quiet_ffmpeg()
-        wait_ms = max(1000, round(2000 * config.stall_timeout_s))
-        options = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 8000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, wait_ms]
-        with ffmpeg_options(_STREAM_OPTIONS):
-            capture = cv2.VideoCapture(url, cv2.CAP_FFMPEG, options)
-        if not capture.isOpened():
-            raise InputError("FFmpeg found no stream there")
-        return capture
+    def _decoded(container: InputContainer) -> Images:
+        with container:
+            stream = next((s for s in container.streams.video if s.codec_context is not None), None)
+            if stream is None:
+                return
+            stream.thread_type = "SLICE"  # threads by frames are late by as many frames
+            decoder = Decoder(stream.codec_context, stream.time_base or Fraction(1, 90_000), stream.sample_aspect_ratio)
+            with contextlib.suppress(pyav().error.FFmpegError):  # the connection ended
+                for packet in container.demux(stream):
+                    yield from decoder.images(packet)
 
     return LiveSource(url, connect, config)

@@ -1,227 +1,320 @@
-"""Video file, decoded by FFmpeg, with the container's presentation times."""
+"""Video of files and of packets in messages, decoded by FFmpeg's libraries (PyAV)."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import os
-import threading
-from collections import deque
-from collections.abc import Iterator
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
-from drocap_ros.perception.sources.movie_index import formats, largest_alone, movie_s
-from drocap_ros.perception.sources.pixels import to_bgr
 
 if TYPE_CHECKING:
-    import cv2
+    import av
+    from av.container import InputContainer
+    from av.filter import Graph
+    from av.video.codeccontext import VideoCodecContext
+    from av.video.frame import VideoFrame
+    from av.video.stream import VideoStream
 
 log = logging.getLogger(__name__)
 
+#: Version of PyAV that tells what an edit list hides and passes over tracks without reading them.
+_LEAST_PYAV = (17, 1)
 #: Missing frames at the end, against the container's count, from which the file counts as cut off.
 _TAIL_FRAMES = 2
-#: First bytes of Matroska and WebM, which state a duration and no count.
-_MATROSKA = b"\x1a\x45\xdf\xa3"
-#: Codecs in words by their codes; others are named by their codes.
-_CODECS = {"AV01": "AV1", "AVC1": "H.264", "H264": "H.264", "HEVC": "H.265", "HVC1": "H.265", "HEV1": "H.265"}
-#: Least and most first pictures that are compared, since OpenCV 4.13 leaves interlaced ones unwritten.
-_PROBED = (5, 24)
-#: A larger packet changes its picture: that of a still one has some bytes, and a bit or two for each block of 256 px.
-_STILL_BYTES, _STILL_PIXELS = 200, 1024
 #: Pixels of other shapes are not believed.
-_MAX_ASPECT = 4.0
-_CONVERT = "ffmpeg -i IN -vf yadif -c:v libx264 -pix_fmt yuv420p OUT.mp4"
+_MAX_ASPECT = 4
+_NS = 10**9
+#: Codecs of messages' packets by their names there.
+_CODECS = {r"[hx]\.?264|avc": "h264", r"[hx]\.?265|hevc": "hevc", "vp9": "vp9", "av1": "av1", "mjpe?g": "mjpeg"}
 
 
-def quiet_ffmpeg() -> None:
-    """Silence FFmpeg's and OpenCV's messages; drocap reports each failure once."""
-    import cv2
+def pyav() -> Any:
+    """The package av."""
+    needed = ".".join(map(str, _LEAST_PYAV))
+    try:
+        import av
+    except ImportError:
+        found = "found none"
+    else:
+        if tuple(map(int, av.__version__.split(".")[:2])) >= _LEAST_PYAV:
+            return av
+        found = f"found {av.__version__}"
+    raise InputError(
+        f'video: expected PyAV {needed} or newer, {found}; run {sys.executable} -m pip install "av>={needed}"'
+    )
 
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    if hasattr(cv2, "setLogLevel"):  # to OpenCV 4.6 (Ubuntu 24.04)
-        cv2.setLogLevel(0)
-    elif hasattr(cv2.utils, "logging"):
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+def open_container(path: Path) -> InputContainer:
+    """The container of a video file, which no other file or address can take part in."""
+    av = pyav()
+    # An absolute path is never taken for a protocol.
+    return av.open(str(path.absolute()), options={"protocol_whitelist": "file"}, metadata_errors="replace")  # type: ignore[no-any-return]
 
 
-#: OpenCV passes options to FFmpeg through one environment variable of the process.
-_OPTIONS_LOCK = threading.Lock()
-_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+def codec_of(name: str) -> str | None:
+    """FFmpeg's name of the video codec that the format of a message names."""
+    return next((codec for pattern, codec in _CODECS.items() if re.search(pattern, name, re.IGNORECASE)), None)
 
 
-@contextlib.contextmanager
-def ffmpeg_options(options: str | None) -> Iterator[None]:
-    """Options for captures opened inside the context; options in the user's environment take precedence."""
-    with _OPTIONS_LOCK:
-        if options is None or _OPTIONS in os.environ:
-            yield
-            return
-        os.environ[_OPTIONS] = options
+class Decoder:
+    """Images of the packets of one stream as they are shown: progressive, upright, with square pixels, of one size.
+
+    A packet that does not decode is counted and passed over.
+    """
+
+    def __init__(self, context: VideoCodecContext, time_base: Fraction, aspect: Fraction | None = None) -> None:
+        self._av = pyav()
+        self._context, self._time_base = context, time_base
+        self._aspect = aspect if aspect and 1 / Fraction(_MAX_ASPECT) <= aspect <= _MAX_ASPECT else Fraction(1)
+        self._scaler = self._av.video.reformatter.VideoReformatter()
+        self._size: tuple[int, int] | None = None
+        self._progressive: Graph | None = None
+        #: Times of packets that did not decode, None where a packet has none, s.
+        self.damaged: list[float | None] = []
+
+    def images(self, packet: av.Packet[Any] | None) -> Iterator[tuple[int | None, np.ndarray]]:
+        """Presentation times in ns and images (H, W, 3) uint8 BGR that follow from the next packet; None ends them."""
         try:
-            yield
-        finally:
-            del os.environ[_OPTIONS]
+            frames = self._context.decode(packet)
+        except self._av.error.EOFError:
+            return
+        except self._av.error.FFmpegError:
+            pts = packet.pts if packet else None
+            self.damaged.append(None if pts is None else float(pts * self._time_base))
+            return
+        for frame in frames:
+            yield from map(self._shown, self._deinterlaced(frame))
+        if self._progressive is not None and (packet is None or not packet.size):
+            self._progressive.vpush(None)
+            yield from map(self._shown, self._filtered())
+
+    def _deinterlaced(self, frame: VideoFrame) -> Iterator[VideoFrame]:
+        if self._progressive is None:
+            if not frame.interlaced_frame:
+                yield frame
+                return
+            graph = self._progressive = self._av.filter.Graph()
+            source = graph.add_buffer(
+                width=frame.width, height=frame.height, format=frame.format.name, time_base=self._time_base
+            )
+            graph.link_nodes(source, graph.add("yadif", "deint=interlaced"), graph.add("buffersink")).configure()
+        self._progressive.vpush(frame)
+        yield from self._filtered()
+
+    def _filtered(self) -> Iterator[VideoFrame]:
+        assert self._progressive is not None
+        with contextlib.suppress(self._av.error.BlockingIOError, self._av.error.EOFError):
+            while True:
+                yield self._progressive.vpull()
+
+    def _shown(self, frame: VideoFrame) -> tuple[int | None, np.ndarray]:
+        if self._size is None:
+            across = max(self._aspect, Fraction(1))
+            self._size = round(frame.width * across), round(frame.height * across / self._aspect)
+        # The way of OpenCV and of the program ffmpeg.
+        bgr = self._scaler.reformat(frame, *self._size, "bgr24", interpolation="BICUBIC").to_ndarray()
+        pts = frame.dts if frame.pts is None else frame.pts
+        time_ns = None if pts is None else round(pts * (frame.time_base or self._time_base) * _NS)
+        return time_ns, _upright(bgr, frame.side_data.get(self._av.sidedata.sidedata.Type.DISPLAYMATRIX))
+
+
+def _upright(image: np.ndarray, matrix: Any) -> np.ndarray:
+    """The image turned and mirrored by a display matrix of FFmpeg: rows a b u, c d v, which take x y to x' y'."""
+    if matrix is None:
+        return image
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].astype(np.int64)
+    if abs(a) + abs(d) < abs(b) + abs(c):
+        image, a, d = image.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
 
 
 class VideoSource(ImageSource):
-    """Frames of a video file.
+    """Frames of a video file, of its largest track.
 
     A stamp is the frame's presentation time in its container, from 0 at the first; variable frame rates keep
-    their times.  Rotation metadata is applied.  A file that is cut off gives its frames up to the cut and an
-    ``ENDED_EARLY`` event.
+    their times.  What an edit list hides is left out.  Decoding goes on after damage, and a ``DAMAGED`` event
+    follows at the end; a file that is cut off gives its frames up to the cut and an ``ENDED_EARLY`` event.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        quiet_ffmpeg()
         self.path = path
         if not path.is_file():
             raise InputError(f"{path}: expected a video file, found no such file; check the path")
         if (kind := file_kind(path)) is not FileKind.VIDEO:
             raise InputError(f"{path}: expected a video file, found {kind.value}; check the path, or record it again")
-        self._pending = deque[Frame]()
-        self._begin(self._opened())
-        if not self._pending or self._unwritten():
-            self._refuse()
-        height, width = self._pending[0].image.shape[:2]
-        self.size = (width, height)
-
-    def _opened(self) -> cv2.VideoCapture:
-        import cv2
-
-        # The options are held: not while another thread opens with its own.
-        with ffmpeg_options(None), largest_alone(self.path) as name:
-            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
-        if not capture.isOpened():
+        self._error = pyav().error.FFmpegError
+        try:
+            self._container = open_container(path)
+        except self._error as error:
             raise InputError(
-                f"{self.path}: expected a video that FFmpeg can open, found {self.path.stat().st_size} bytes without a"
-                f" readable header or index (cut off, or of an unknown codec{formats(self.path)}); copy it again"
-            )
-        return capture
-
-    def _begin(self, capture: cv2.VideoCapture) -> None:
-        """Read the first picture, and what the container states."""
-        import cv2
-
-        self._capture = capture
-        self._origin_ns: int | None = None
+                f"{path}: expected a video that FFmpeg can open, found {path.stat().st_size} bytes without a readable"
+                f" header or index ({first_line(error)}); copy it again"
+            ) from None
+        self._closed = False
         self._last_ns: int | None = None
+        self._origin_ns: int | None = None
         self._count = 0
-        with self.path.open("rb") as file:
-            self._counted = file.read(4) != _MATROSKA
-        stated, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), self._nominal_rate()
-        # A container without an index states a negative or huge number.
-        self.length = int(stated) if 0 < stated < 1e9 else None
-        shown_s = movie_s(self.path)
-        if self.length and shown_s and shown_s * rate < self.length - _TAIL_FRAMES:
-            self.length = max(1, round(shown_s * rate))  # an edit list hides the others, as after a trim
-        self.duration_s = (self.length - 1) / rate if self.length else None
-        self._pending = deque(frame for frame in (self._decode(),) if frame)
+        self._begin()
 
-    def _unwritten(self) -> bool:
-        """Whether the first pictures are equal although their packets differ and change them."""
-        import cv2
+    def _begin(self) -> None:
+        """Choose the track, read what the container states, and the first picture."""
+        known = [stream for stream in self._container.streams.video if stream.codec_context is not None]
+        known = [s for s in known if not s.disposition & s.disposition.attached_pic] or known
+        if not known:
+            raise self._refused(f"no video of a known codec ({', '.join(track_codes(self.path)) or 'no track'})")
+        self._stream = max(known, key=lambda stream: stream.width * stream.height)
+        self._stream.thread_type = "AUTO"
+        self._decoder = Decoder(self._stream.codec_context, _time_base(self._stream), self._stream.sample_aspect_ratio)
+        rate = float(self._stream.guessed_rate or 0)
+        self._rate_hz = rate if 0.1 < rate < 1000 else 30.0
+        self._stated_s = stated_s(self._container, self._stream)
+        self.length = self._stated_length()
+        self.duration_s = (self.length - 1) / self._rate_hz if self.length else None
+        self._images = self._decoded()
+        first = self._first = self._next()
+        if first is None:
+            raise self._refused(f"{self._stream.codec_context.codec.long_name} without a frame that it decodes")
+        self.size = (first.image.shape[1], first.image.shape[0])
 
-        first = self._pending[0].image
-        while len(self._pending) < _PROBED[1] and (frame := self._decode()):
-            if not np.array_equal(frame.image, first):
-                self._pending.append(frame)
-                return False
-            self._pending.append(Frame(frame.stamp_ns, first))  # many of them are one in memory
-        raw = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
-        raw.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are
-        packets = [packet.tobytes() for ok, packet in (raw.read() for _ in self._pending) if ok]
-        raw.release()
-        largest_still = _STILL_BYTES + first.shape[0] * first.shape[1] // _STILL_PIXELS
-        differ = len(set(packets)) >= _PROBED[0]  # some programs repeat packets to raise the rate
-        return differ and float(np.median([len(packet) for packet in packets])) > largest_still
-
-    def _refuse(self) -> None:
-        import cv2
-
-        code = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin1").upper()
-        words = f"{_CODECS.get(code, code)} without a frame that it decodes"
-        words = "interlaced pictures that it leaves empty" if self._pending else words
+    def _refused(self, found: str) -> InputError:
         self.close()
-        opencv = f"OpenCV {cv2.__version__}"
-        raise InputError(f"{self.path}: expected a video for {opencv}, found {words}; convert it: {_CONVERT}")
+        return InputError(f"{self.path}: expected a video for FFmpeg, found {found}; convert it: ffmpeg -i IN OUT.mp4")
+
+    def _stated_length(self) -> int | None:
+        """Number of shown frames."""
+        by_time = self._stated_s * self._rate_hz if self._stated_s else None
+        if not self._stream.frames:
+            return round(by_time) or None if by_time and by_time < 1e9 else None
+        if by_time and by_time < self._stream.frames - _TAIL_FRAMES:  # an edit list hides some, as after a trim
+            return sum(not entry.is_discard for entry in self._stream.index_entries) or None
+        return self._stream.frames
 
     def read(self) -> Frame | None:
         """Next frame, or None at the end."""
-        frame = self._pending.popleft() if self._pending else self._decode()
+        frame, self._first = self._first or self._next(), None
         if frame is None:
             self._report_end()
-            return None
-        self._count += 1
+            self.close()
+        else:
+            self._count += 1
         return frame
 
-    def _decode(self) -> Frame | None:
-        import cv2
+    def _next(self) -> Frame | None:
+        found = None if self._closed else next(self._images, None)
+        return Frame(self._stamp(found[0]), found[1]) if found else None
 
-        ok, image = self._capture.read()
-        if not ok:
-            return None
-        return Frame(self._stamp(self._capture.get(cv2.CAP_PROP_POS_MSEC)), self._square(to_bgr(image)))
+    def _decoded(self) -> Iterator[tuple[int | None, np.ndarray]]:
+        try:
+            for packet in self._container.demux(self._stream):
+                yield from self._decoder.images(packet)
+        except self._error:  # the container ends in damage
+            yield from self._decoder.images(None)
 
-    def _square(self, image: np.ndarray) -> np.ndarray:
-        """The picture as it is shown, where its pixels are no squares."""
-        import cv2
-
-        ratio = self._capture.get(cv2.CAP_PROP_SAR_NUM) / (self._capture.get(cv2.CAP_PROP_SAR_DEN) or 1.0)
-        if ratio == 1.0 or not 1 / _MAX_ASPECT <= ratio <= _MAX_ASPECT:
-            return image
-        turned = int(self._capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
-        across = 1 / ratio if turned else ratio
-        height, width = image.shape[:2]
-        size = (round(width * across), height) if across > 1 else (width, round(height / across))
-        return cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
-
-    def _stamp(self, position_ms: float) -> int:
-        now = round(position_ms * 1e6)
-        if self._origin_ns is None:
-            self._origin_ns = now
-        now -= self._origin_ns
-        if self._last_ns is not None and now <= self._last_ns:
-            # FFmpeg gives 0 for each frame of a stream without times (raw H.264).
-            step = round(1e9 / self._nominal_rate())
-            kind = SourceEventKind.NO_TIMES
-            if not any(e.kind is kind for e in self._events) and now == 0:
-                self._events.append(SourceEvent(kind, str(self.path), "the nominal rate is used"))
-            now = self._last_ns + step
+    def _stamp(self, time_ns: int | None) -> int:
+        if self._last_ns is None:
+            self._origin_ns, now = time_ns, 0
+        else:
+            now = -1 if time_ns is None or self._origin_ns is None else time_ns - self._origin_ns
+            if now <= self._last_ns:
+                if time_ns is None:  # raw H.264
+                    self._tell(SourceEventKind.NO_TIMES, "the nominal rate is used")
+                now = self._last_ns + round(_NS / self._rate_hz)
         self._last_ns = now
         return now
 
-    def _nominal_rate(self) -> float:
-        import cv2
-
-        rate = float(self._capture.get(cv2.CAP_PROP_FPS))
-        return rate if 0.1 < rate < 1000 else 30.0
+    def _tell(self, kind: SourceEventKind, detail: str) -> None:
+        if all(event.kind is not kind for event in self._events):
+            self._events.append(SourceEvent(kind, str(self.path), detail))
 
     def _report_end(self) -> None:
-        if self._capture.isOpened() and (detail := self._missing_end()):
-            event = SourceEvent(SourceEventKind.ENDED_EARLY, str(self.path), f"cut off or damaged, {detail} decoded")
+        if self._closed or self._last_ns is None:
+            return
+        end_s, before = self._last_ns * 1e-9, len(self._events)
+        decoded = f"{self._count} of {self.length} frames decoded"
+        if not self._stream.frames:
+            decoded = f"{end_s:.1f} of {self._stated_s or end_s:.1f} s decoded"
+        short = not self._stream.frames or (self.length is not None and self._count < self.length - _TAIL_FRAMES)
+        tail_s = _TAIL_FRAMES * end_s / max(self._count - 1, 1)
+        if short and self._stated_s and end_s + tail_s < self._stated_s - _TAIL_FRAMES / self._rate_hz:
+            self._tell(SourceEventKind.ENDED_EARLY, f"cut off or damaged, {decoded}")
+        elif damaged := self._decoder.damaged:
+            near = next((f" near {time_s:.1f} s" for time_s in damaged if time_s is not None), "")
+            self._tell(SourceEventKind.DAMAGED, f"{len(damaged)} packets do not decode{near}, {decoded}")
+        for event in self._events[before:]:
             log.warning(str(event))
-            self._events.append(event)
-        self.close()
-
-    def _missing_end(self) -> str:
-        """What is missing, or nothing."""
-        if self.length is None or self.duration_s is None or self._count >= self.length - _TAIL_FRAMES:
-            return ""
-        if self._counted:
-            return f"{self._count} of {self.length} frames"
-        # The count is the duration times a rate, which may be far from that of the frames.
-        end_s = (self._last_ns or 0) * 1e-9
-        if end_s + _TAIL_FRAMES * end_s / max(self._count - 1, 1) >= self.duration_s:
-            return ""
-        return f"{end_s:.1f} of {self.duration_s:.1f} s"
 
     def close(self) -> None:
         """Close the file."""
-        self._capture.release()
+        self._closed = True
+        self._container.close()
+
+
+def _time_base(stream: VideoStream) -> Fraction:
+    return stream.time_base or Fraction(1, _NS)
+
+
+def stated_s(container: InputContainer, stream: VideoStream) -> float | None:
+    """Duration that a file states of a stream, else of all, s."""
+    if stream.duration:
+        return float(stream.duration * _time_base(stream))
+    return container.duration / 1e6 if container.duration else None
+
+
+def track_codes(path: Path) -> list[str]:
+    """Formats of the tracks of an MP4 or MOV file (ISO/IEC 14496-12), such as avc1 and djmd; none of another file.
+
+    FFmpeg has the tracks in this order, and tells no format that it does not know.
+    """
+    end = path.stat().st_size
+    with path.open("rb") as file:
+        place = 0
+        for _ in range(_MAX_BOXES):
+            file.seek(place)
+            head = file.read(16)
+            size = int.from_bytes(head[8:] if head[:4] == b"\0\0\0\x01" else head[:4], "big")
+            if head[4:8] == b"moov" and size <= _MAX_INDEX:
+                tracks = file.read(size).split(b"trak")[1:]
+                found = (re.search(rb"stsd.{12}(.{4})", track, re.DOTALL) for track in tracks)
+                return [match[1].decode("latin1") if match else "" for match in found]
+            if size < 8 or (place := place + size) >= end:
+                break
+    return []
+
+
+#: Bounds against damaged files: boxes at one level, and the bytes of an index of hours.
+_MAX_BOXES, _MAX_INDEX = 4096, 1 << 26
+
+
+def decoded_packets(codec: str, packets: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, np.ndarray]]:
+    """Stamps and images of packets with their stamps; those before the first key frame are left out."""
+    name = codec_of(codec)
+    if name is None:
+        raise InputError(f"video: expected H.264, H.265, VP9, AV1 or MJPEG, found {codec[:40]!r}; convert it")
+    av = pyav()
+    context = av.CodecContext.create(name, "r")
+    context.thread_type = "AUTO"
+    decoder, none = Decoder(context, Fraction(1, _NS)), True
+    for stamp_ns, data in packets:
+        if data:
+            packet = av.Packet(len(data))  # made of Python's bytes it would be freed by threads of FFmpeg: a deadlock
+            packet.update(data)
+            packet.pts, packet.time_base = stamp_ns, Fraction(1, _NS)
+            for time_ns, image in decoder.images(packet):
+                none = False
+                yield stamp_ns if time_ns is None else time_ns, image
+    for time_ns, image in decoder.images(None):
+        none = False
+        yield time_ns or 0, image
+    if none:
+        raise InputError(f"video: expected a key frame of {codec[:40]!r}, found none; record it again")

@@ -13,10 +13,9 @@ import numpy as np
 
 from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.reconstruction.camera.path_adjustment import ENOUGH_POINTS, AdjustedPath
-from drocap_ros.reconstruction.camera.path_equations import PathEquations
 from drocap_ros.reconstruction.camera.path_model import KNOT, SHARED, PathConfig, PathInput, PathState
-from drocap_ros.reconstruction.camera.path_residuals import OUTLIER_SQUARE, PathResiduals, weights_of
-from drocap_ros.reconstruction.common.banded import band_factor, forward
+from drocap_ros.reconstruction.camera.path_residuals import OUTLIER_SQUARE, PathEquations, PathResiduals, weights_of
+from drocap_ros.reconstruction.common.engine import band_factor, forward
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 
 #: Share of the difference that one cause explains, at least, to be named.

@@ -10,20 +10,20 @@ import numpy as np
 from drocap_ros.camera_path import CameraErrors, CameraPath, Kind, PictureFacts, Teller
 from drocap_ros.geometry.pinhole import centred_camera
 from drocap_ros.reconstruction.camera.growth import (
+    ENOUGH_PARALLAX,
     LAST_STEPS,
     Growth,
+    Pair,
     adjusted,
     begin,
+    candidate_pairs,
     small_motion,
     turns,
     with_ends,
 )
-from drocap_ros.reconstruction.camera.kinds import kind_of, turning_focal
-from drocap_ros.reconstruction.camera.pairs import ENOUGH_PARALLAX, Pair, candidate_pairs
+from drocap_ros.reconstruction.camera.kinds import Sightings, kind_of, turning_focal
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
-from drocap_ros.reconstruction.camera.path_model import FOCAL, Knots, PathConfig, PathInput
-from drocap_ros.reconstruction.camera.sightings import Sightings
-from drocap_ros.reconstruction.camera.views import views_of
+from drocap_ros.reconstruction.camera.path_model import FOCAL, Knots, PathConfig, PathInput, views_of
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 

@@ -27,11 +27,10 @@ from drocap_ros.reconstruction.camera.path_model import (
     PathConfig,
     PathInput,
     PathState,
+    views_of,
 )
-from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
-from drocap_ros.reconstruction.common.windows import fade_weights, windows
-from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.common.windows import even_slots, fade_weights, windows
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, at_other_time
 from drocap_ros.reconstruction.world.even_capture import at_all_slots, capture_parts
 from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable

@@ -4,19 +4,113 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.camera_path import CameraErrors
 from drocap_ros.geometry.rotations import exp_so3, log_so3
-from drocap_ros.reconstruction.camera.ground_plane import largest_plane
-from drocap_ros.reconstruction.camera.pairs import Pair
+from drocap_ros.reconstruction.camera.kinds import Sightings, rays, turn_between
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path, improved_path
-from drocap_ros.reconstruction.camera.path_model import FOCAL, PathConfig, PathInput
-from drocap_ros.reconstruction.camera.resection import LEAST_POINTS, resected
-from drocap_ros.reconstruction.camera.sightings import Sightings, rays, turn_between
-from drocap_ros.reconstruction.camera.views import Views, triangulate
+from drocap_ros.reconstruction.camera.path_model import FOCAL, PathConfig, PathInput, Views, triangulate
+from drocap_ros.reconstruction.camera.upright import largest_plane
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+
+#: Distance (px) of a point from its projection within which it agrees with a pose.
+AGREES_PX = 4.0
+#: Points that agree, at least, and share of them.
+LEAST_POINTS = 10
+_LEAST_SHARE = 0.4
+#: Most steps from the expected pose, and the square over the median one at which a point has half its weight.
+_STEPS = 12
+_OVER_MEDIAN = 4.0
+#: Least depth of a point over the median one, and change of the residuals' median (px) that ends the steps.
+_NEAREST = 0.01
+_CONVERGED_PX = 0.01
+
+
+def resected(
+    places: np.ndarray, pixels: np.ndarray, matrix: np.ndarray, rotation: np.ndarray, position: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rotation (3, 3) world -> camera and position (3,) that points (N, 3) at (N, 2) px agree with; None = none.
+
+    Robust Gauss-Newton steps from the expected ``rotation`` and ``position``.
+    """
+    focal, before = np.diagonal(matrix)[:2], np.inf
+    for _ in range(_STEPS):
+        seen = (places - position) @ rotation.T
+        x, y, z = seen.T
+        z = np.maximum(z, _NEAREST * float(np.median(np.abs(z))) + 1e-12)
+        slope = seen[:, :2] / z[:, None]
+        rest = focal * slope + matrix[:2, 2] - pixels
+        square = np.square(rest).sum(axis=1)
+        usual = float(np.median(square))
+        if abs(before - np.sqrt(usual)) < _CONVERGED_PX:
+            break
+        before = float(np.sqrt(usual))
+        weight = 1.0 / (1.0 + square / max(AGREES_PX**2, _OVER_MEDIAN * usual))
+        # Rows of u and v: by the position, then by a turn in camera axes, as in ``path_residuals``.
+        per_unit = (weight / z)[:, None] * focal
+        rows = np.empty((len(places), 2, 6))
+        rows[:, :, :3] = -per_unit[..., None] * (rotation[:2] - slope[..., None] * rotation[2])
+        rows[:, 0, 3:] = np.stack([-slope[:, 0] * y, z + slope[:, 0] * x, -y], axis=1)
+        rows[:, 1, 3:] = np.stack([-z - slope[:, 1] * y, slope[:, 1] * x, x], axis=1)
+        rows[:, :, 3:] *= per_unit[..., None]
+        flat = rows.reshape(-1, 6)
+        normal = flat.T @ flat
+        try:
+            step = np.linalg.solve(normal, -flat.T @ (weight[:, None] * rest).reshape(-1))
+        except np.linalg.LinAlgError:
+            return None
+        position, rotation = position + step[:3], exp_so3(step[3:]) @ rotation
+    agree = (square < AGREES_PX**2) & (seen[:, 2] > 0.0)
+    return (rotation, position) if agree.sum() >= max(LEAST_POINTS, _LEAST_SHARE * len(places)) else None
+
+
+#: Times (s) between the keyframes of a pair, and how many places of a recording are tried.
+_PAIR_S = (0.5, 1.0, 2.0, 3.0)
+_PLACES = 12
+#: Points that both keyframes of a pair see, at least, and pairs that are tried.
+_LEAST_COMMON = 16
+_PAIRS = 3
+#: Parallax (rad) above which more helps no pair, and from which a camera does not move little: six degrees.
+ENOUGH_PARALLAX = 0.1
+#: Percentile of the points' parallaxes that counts.
+_NEARER = 75
+
+
+class Pair(NamedTuple):
+    """Two keyframes, the parallax (rad) of the nearer points, and their worth as a beginning."""
+
+    first: int
+    second: int
+    parallax: float
+    score: float
+
+
+def candidate_pairs(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> list[Pair]:
+    """Pairs with much parallax and many common points, best first."""
+    found: list[Pair] = []
+    for lag_s in _PAIR_S:
+        lag = max(round(lag_s * key_hz), 1)
+        if lag >= len(sightings):
+            continue
+        for first in np.unique(np.linspace(0, len(sightings) - 1 - lag, _PLACES).astype(int)).tolist():
+            both = sightings.common(first, first + lag)
+            if len(both.piece) < _LEAST_COMMON:
+                continue
+            _, angle = turn_between(rays(both.first, matrix), rays(both.second, matrix))
+            # Far points have no parallax: that of the nearer points counts.
+            parallax = float(np.percentile(angle, _NEARER))
+            score = min(parallax, ENOUGH_PARALLAX) * float(np.sqrt(len(both.piece)))
+            found.append(Pair(first, first + lag, parallax, score))
+    found.sort(key=lambda pair: -pair.score)
+    apart: list[Pair] = []
+    for pair in found:
+        if all(abs(pair.first - other.first) > key_hz for other in apart):
+            apart.append(pair)
+    return apart[:_PAIRS]
+
 
 #: Distance (px) of a point from its epipolar line or its projection within which it supports a camera.
 _INLIER_PX = 2.0

@@ -2,11 +2,135 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
+
 import numpy as np
 
+from drocap_ros.background import Background
 from drocap_ros.camera_path import Kind
-from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction.camera.sightings import Common, Sightings, rays, turn_between
+from drocap_ros.geometry.rotations import exp_so3, project_to_so3
+from drocap_ros.reconstruction.camera.path_model import Views
+from drocap_ros.tracks import Tracks
+
+#: Steps of reweighting of a turn, and the least scale (rad) of its residuals: a tenth of a pixel.
+_TURN_STEPS = 8
+_LEAST_ANGLE = 1e-4
+
+
+class Common(NamedTuple):
+    """What two keyframes both see: piece (N,), and where, (N, 2) px each."""
+
+    piece: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+
+
+class Sightings:
+    """Views (of pieces of tracks) at keyframes (K,), frames in ascending order."""
+
+    def __init__(self, views: Views, frames: np.ndarray) -> None:
+        self.views, self.frames = views, frames
+        order, _ = views.by_frame
+        bounds = np.searchsorted(views.frame[order], np.stack([frames, frames + 1]))
+        self.rows = [order[begin:end] for begin, end in bounds.T.tolist()]
+
+    @cached_property
+    def at_keys(self) -> Views:
+        """The views at the keyframes alone, as frames 0 to K - 1."""
+        key = np.full(self.views.frames, -1)
+        key[self.frames] = np.arange(len(self))
+        views, _ = self.views.at_frames(key >= 0)
+        return replace(views, frame=key[views.frame], frames=len(self))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def at(self, key: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pieces (N,), ascending, and where they are seen, (N, 2) px."""
+        rows = self.rows[key]
+        return self.views.piece[rows], self.views.point[rows]
+
+    def common(self, first: int, second: int) -> Common:
+        """What both keyframes see."""
+        (a, at_a), (b, at_b) = self.at(first), self.at(second)
+        both, in_a, in_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
+        return Common(both, at_a[in_a], at_b[in_b])
+
+
+def rays(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Directions (N, 3) of length 1 of points (N, 2) px, in camera axes."""
+    plane = (points - matrix[:2, 2]) / np.diagonal(matrix)[:2]
+    out = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
+def turn_between(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) that best maps directions (N, 3) to others, robust, and the angles (N,) rad that remain."""
+    weight = np.ones(len(first))
+    for _ in range(_TURN_STEPS):
+        rotation = project_to_so3((weight[:, None] * second).T @ first)
+        angle = np.linalg.norm(second - first @ rotation.T, axis=1)
+        weight = 1.0 / (1.0 + np.square(angle / max(float(np.median(angle)), _LEAST_ANGLE))) ** 2
+    return rotation, angle
+
+
+#: Points with which an image tells.
+_LEAST_POINTS = 12
+#: Share of the points that goes on over a cut, at most: some corners of the new image look like those of the old one.
+_GOES_ON = 0.05
+#: Longest time (s) without points that counts as a cut: a fade; later no point could go on anyway.
+_FADE_S = 0.5
+#: Logarithm of the factor by which an image grows or shrinks at once where a cut leads to a nearer or farther view of
+#: the same scene, and how many times that between the images beside: clips of drones and hands, with 5 to 60 images a
+#: second, have up to 0.04, and that steadily.
+_GROWS = 0.05
+_AT_ONCE = 4.0
+#: Distance (px) of points from their middle below which they tell no growth: errors of tracks are as large.
+_SAME_SIZE_PX = 1.0
+
+
+def cut_times(tracks: Tracks) -> list[float]:
+    """Times (s) of the cuts in a clip without telemetry, by its fixed points."""
+    if tracks.background is None or tracks.camera_rotation is not None:
+        return []
+    time_s = (tracks.stamp_ns - tracks.stamp_ns[0]) * 1e-9
+    return [float(time_s[image]) for image in cuts(tracks.background, time_s)]
+
+
+def cuts(points: Background, time_s: np.ndarray) -> list[int]:
+    """First images of further shots: hardly a point goes on there, or the picture is larger or smaller at once.
+
+    time_s : (F,) of the images
+    """
+    order = np.argsort(points.frame, kind="stable")
+    rows = np.split(order, np.searchsorted(points.frame[order], np.arange(1, len(time_s))))
+    pairs = list(pairwise(image for image, seen in enumerate(rows) if len(seen) >= _LEAST_POINTS))
+    compared = [_compared(points, rows[before], rows[after]) for before, after in pairs]
+    growth = np.array([0.0, *(grown for _, grown in compared), 0.0])
+    beside = np.maximum(growth[:-2], growth[2:])
+    jumps = growth[1:-1] > np.maximum(_GROWS, _AT_ONCE * beside)
+    return [
+        before + 1
+        for (before, after), (share, _), jump in zip(pairs, compared, jumps, strict=True)
+        if (share < _GOES_ON or jump) and time_s[after] - time_s[before] <= _FADE_S
+    ]
+
+
+def _compared(points: Background, before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """Share of the points that two images have in common, and the size of the logarithm by which most grow apart."""
+    common, *places = np.intersect1d(points.track[before], points.track[after], return_indices=True)
+    share = len(common) / min(len(before), len(after))
+    if len(common) < _LEAST_POINTS:
+        return share, 0.0
+    first, second = (
+        np.maximum(np.linalg.norm(seen - np.median(seen, axis=0), axis=1), _SAME_SIZE_PX)
+        for seen in (points.point[rows[place]] for rows, place in zip((before, after), places, strict=True))
+    )
+    return share, float(np.abs(np.median(np.log(second / first))))
+
 
 #: Times (s) between the keyframes that are compared, and most pairs of each.
 _LAGS_S = (1.0, 3.0)

@@ -13,7 +13,7 @@ from drocap_ros.reconstruction.camera.from_picture import camera_from_points
 from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ
 from drocap_ros.reconstruction.camera.upright import set_upright
 from drocap_ros.reconstruction.common.poses import ImagePoses
-from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.common.windows import even_slots
 from drocap_ros.reconstruction.world.even_capture import LEAST_FRAMES
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import place_in_world

@@ -22,9 +22,14 @@ from functools import lru_cache
 import numpy as np
 
 from drocap_ros.geometry.bones import pair_lengths
-from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
-from drocap_ros.reconstruction.common.line_search import search_line
-from drocap_ros.reconstruction.common.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
+from drocap_ros.reconstruction.common.engine import (
+    Equations,
+    add_second_difference,
+    descend,
+    pull_second_difference,
+    second_difference,
+)
+from drocap_ros.reconstruction.common.poses import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
 from drocap_ros.skeleton import BODY_17, RIGID_BONES, indices
 
 _CHAIN = BODY_17.bones
@@ -101,7 +106,7 @@ class _Residuals:
     """Residuals at one point, shared by the cost and its derivatives."""
 
     def __init__(self, p: AdjustmentProblem, joints: np.ndarray, lengths: np.ndarray, zooms: np.ndarray) -> None:
-        self.joints, self.lengths, self.zooms = joints, lengths, zooms
+        self.problem, self.joints, self.lengths, self.zooms = p, joints, lengths, zooms
         self.zoom = 1.0 + p.zoom_basis @ zooms
         self.zoom_pull = p.zoom_precision @ zooms
         self.growth = lengths - p.lengths
@@ -122,7 +127,7 @@ class _Residuals:
         length = np.sqrt(np.square(span).sum(axis=-1) + 1e-6)
         self.direction = span / length[..., None]
         self.stretch = (length - self.zoom[:, None] * lengths) / SPAN_STD_MM
-        self.swing = joints[2:] - 2 * joints[1:-1] + joints[:-2]
+        self.swing = second_difference(joints)
         self.terms = {
             "reprojection": 0.5 * float((square * self.robust).sum()),
             "lifter_image": 0.5 * float((p.prior_weight_xy * np.square(self.flat).sum(axis=-1)).sum()),
@@ -134,9 +139,17 @@ class _Residuals:
         }
         self.cost = sum(self.terms.values())
 
+    def moved(self, joints: np.ndarray, sizes: np.ndarray) -> _Residuals:
+        """The point after a step of the joints (F, 17, 3), of the lengths and the zoom's coefficients (18 + K,)."""
+        count = len(SPANS)
+        return _Residuals(self.problem, self.joints + joints, self.lengths + sizes[:count], self.zooms + sizes[count:])
+
+    def gradient(self) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of the cost by the same unknowns."""
+        return _gradient(self.problem, self)
+
 
 def _gradient(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the cost: (F, 17, 3) by the joints, (18 + K,) by the lengths and the zoom's coefficients."""
     g = np.zeros(p.prior.shape)
     g[..., :2] = np.square(r.robust)[..., None] * r.pull + p.prior_weight_xy[..., None] * r.flat
     g[..., 2] = p.prior_weight_z * r.depth / r.rounded
@@ -144,10 +157,7 @@ def _gradient(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarr
     for k, (a, b) in enumerate(SPANS):
         g[:, b] += pull[:, k]
         g[:, a] -= pull[:, k]
-    swing = p.acceleration_weight * r.swing
-    g[2:] += swing
-    g[1:-1] -= 2 * swing
-    g[:-2] += swing
+    pull_second_difference(g, p.acceleration_weight * r.swing)
     by_length = p.length_weight * r.growth - (r.zoom[:, None] * r.stretch / SPAN_STD_MM).sum(axis=0)
     by_zoom = r.zoom_pull - p.zoom_basis.T @ (r.stretch @ (r.lengths / SPAN_STD_MM))
     return g, np.concatenate([by_length, by_zoom])
@@ -178,13 +188,7 @@ def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
     band.reshape(frames, -1)[:, places] = (pull[..., :, None] * pull[..., None, :]).reshape(frames, -1) @ signs
     band[:, 0::3, 1] += seen[..., 1]
     band[:, :, 0] += diagonal.reshape(frames, _SIZE)
-    if frames > 2:
-        w = p.acceleration_weight
-        for offset, factor in ((0, 1.0), (1, 4.0), (2, 1.0)):
-            band[offset : frames - 2 + offset, :, 0] += factor * w
-        band[: frames - 2, :, _SIZE] -= 2 * w
-        band[1 : frames - 1, :, _SIZE] -= 2 * w
-        band[: frames - 2, :, 2 * _SIZE] += w
+    add_second_difference(p.acceleration_weight, *(band[:, :, ahead * _SIZE] for ahead in range(3)))
     return band.reshape(frames * _SIZE, -1)
 
 
@@ -250,24 +254,7 @@ def adjust(
 
 def _descend(p: AdjustmentProblem, here: _Residuals) -> _Residuals | None:
     """A lower point along the Gauss-Newton step, or None."""
-    by_joints, by_sizes = _gradient(p, here)
     band, (border, corner) = _band(p, here), _border(p, here)
     band[:, 0] += _DAMPING * (band[:, 0] + 1e-2)
-    factor = band_factor(band)
-    if factor is None:
-        return None
-    # Eliminate the joints: half of a solve for every column, the other half for the answer alone.
-    y = forward(factor, np.concatenate([-by_joints.reshape(-1, 1), border], axis=1))
-    square = y.T @ y
-    schur = corner + np.diag(_DAMPING * np.diag(corner)) - square[1:, 1:]
-    sizes = np.linalg.solve(schur, -by_sizes - square[1:, 0])
-    joints = backward(factor, y[:, :1] - y[:, 1:] @ sizes[:, None]).reshape(by_joints.shape)
-    lengths, zooms = sizes[: len(SPANS)], sizes[len(SPANS) :]
-    slope = float((by_joints * joints).sum() + by_sizes @ sizes)
-    return search_line(
-        here.cost,
-        slope,
-        lambda share: _Residuals(
-            p, here.joints + share * joints, here.lengths + share * lengths, here.zooms + share * zooms
-        ),
-    )
+    corner += np.diag(_DAMPING * np.diag(corner))
+    return descend(here, Equations(band, border, corner), here.moved)

@@ -12,7 +12,7 @@ import numpy as np
 
 from drocap_ros.geometry.bones import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.evidence import Evidence
+from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.lifter import Lifter

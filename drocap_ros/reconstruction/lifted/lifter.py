@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.reconstruction.lifted.feature_network import FeatureNetwork
-from drocap_ros.reconstruction.lifted.network import Errors, LiftedMotion, LifterInput, Network
+from drocap_ros.reconstruction.lifted.network import Errors, FeatureNetwork, LiftedMotion, LifterInput, Network
 from drocap_ros.skeleton import BODY_17, indices
 
 if TYPE_CHECKING:

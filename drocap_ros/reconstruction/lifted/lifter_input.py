@@ -6,8 +6,6 @@ import numpy as np
 
 from drocap_ros.skeleton import BODY_17, indices
 
-#: Frame rate of the network; other rates are resampled.
-LIFTER_FPS = 24.0
 #: Bones whose lengths are input features: that of joint j to its parent stands at j - 1.
 BONES = BODY_17.bones
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.evidence import Evidence
-from drocap_ros.reconstruction.common.spread import Spread
+from drocap_ros.reconstruction.common.poses import Evidence, Spread
+from drocap_ros.reconstruction.common.windows import LIFTER_FPS, even_slots, spread, spread_keypoints
 from drocap_ros.reconstruction.lifted.body_size import (
     YARDSTICK,
     YARDSTICK_MM,
@@ -28,10 +28,8 @@ from drocap_ros.reconstruction.lifted.body_size import (
     magnification,
     measure_size,
 )
-from drocap_ros.reconstruction.lifted.even_frames import even_slots, spread, spread_keypoints
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.lifter import Lifter
-from drocap_ros.reconstruction.lifted.lifter_input import LIFTER_FPS
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled, solve_signs_and_adjust
 
 

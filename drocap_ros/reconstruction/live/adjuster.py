@@ -12,16 +12,14 @@ from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.common.poses import ImagePoses
-from drocap_ros.reconstruction.common.spread import packed
-from drocap_ros.reconstruction.common.stop_reason import DEADLINE
-from drocap_ros.reconstruction.common.threads import blas_threads
+from drocap_ros.reconstruction.common.engine import blas_threads
+from drocap_ros.reconstruction.common.poses import DEADLINE, ImagePoses, packed
 from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.method import WindowSolution, prepare, solve_window
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled
+from drocap_ros.reconstruction.live.initializer import person_size
 from drocap_ros.reconstruction.live.picture_windows import PictureWindows
-from drocap_ros.reconstruction.live.stream_lifter import person_size
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, TelemetryUse, Window
 from drocap_ros.reconstruction.live.world_windows import WorldWindows
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS

@@ -6,10 +6,163 @@ and half a second on their errors differ.
 
 from __future__ import annotations
 
+from collections import OrderedDict, deque
+from typing import NamedTuple
+
 import numpy as np
 
+from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.bones import bone_lengths
+from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
+from drocap_ros.reconstruction.world.world_model import MEASURED
 from drocap_ros.skeleton import BODY_17
+
+#: Images of the last half second (ns) have a say, in which a person moves straight on.
+_PAST_NS = 5 * 10**8
+#: Images that are kept, at most: a solution's ranges are compared over its last three seconds at 30 Hz.
+_MOST_IMAGES = 90
+#: Limits of the factor between ranges: people's statures differ by less.
+_FACTORS = (0.8, 1.25)
+#: Error (m) of the place that an image's pose leaves, over the speed (m/s) of a person who walks: 5 cm at 1 m/s.
+_ERROR_OVER_SPEED_S = 0.05
+#: Standard deviation (m) of the place across the line of sight; a judgement.
+_ACROSS_M = 0.03
+
+
+class PlacedPose(NamedTuple):
+    """joints (P, 3) m and covariance (P, 6) m^2 in ``map``; rotation (3, 3) world -> camera, corrected."""
+
+    joints: np.ndarray
+    covariance: np.ndarray
+    rotation: np.ndarray
+
+
+class _Solution(NamedTuple):
+    """correction : (6,) of the camera; factor : of the range; place : (6,) m^2, covariance of the newest pelvis."""
+
+    correction: np.ndarray
+    factor: float
+    place: np.ndarray
+
+
+_UNSOLVED = _Solution(np.zeros(6), 1.0, np.zeros(6))
+
+
+class LatestPlace:
+    """Places rigid poses by the reported camera, with what the last solution says of both.
+
+    The solution's corrections of the camera apply, and the factor between its ranges and those found here: initial
+    poses know neither the lens nor the world, and lie some percent too near.  A new solution is blended in within
+    ``blend_s``.
+    """
+
+    def __init__(self, blend_s: float) -> None:
+        self._blend_ns = round(blend_s * 1e9)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the person and the solution."""
+        self._solution: _Solution | None = None
+        self._before: _Solution | None = None
+        self._begin_ns = 0
+        self._past: deque[tuple[int, np.ndarray, np.ndarray]] = deque(maxlen=_MOST_IMAGES)
+        self._ranges: OrderedDict[int, float] = OrderedDict()
+
+    def set_solution(self, window: AdjustedWindow, stamp_ns: int) -> None:
+        """Take a window's solution from the image of ``stamp_ns`` on."""
+        if window.in_map is None or window.in_map.path:
+            self._solution = self._before = None
+            return
+        solution = _Solution(window.in_map.correction, self._factor(window), window.covariance[-1, 0])
+        self._before = None if self._solution is None else self._blended(stamp_ns)
+        self._solution, self._begin_ns = solution, stamp_ns
+
+    def place(
+        self, stamp_ns: int, pose: tuple[np.ndarray, np.ndarray], keypoints: np.ndarray, camera: CameraPath | None
+    ) -> PlacedPose | None:
+        """The image's pose in ``map``; None without a solution there, the camera's pose or enough keypoints.
+
+        Parameters
+        ----------
+        pose : joints (P, 3) m and covariance (P, 6) m^2 in camera axes, pelvis at the origin
+        keypoints : (P, 2) px, NaN where not seen
+        camera : as reported at this image alone
+        """
+        joints, covariance = pose
+        seen = np.isfinite(keypoints).all(axis=1)
+        if camera is None or not camera.known[0] or not np.isfinite(joints).all() or seen.sum() < MIN_JOINTS:
+            return None
+        solution = self._blended(stamp_ns) if self._solution is not None else _UNSOLVED
+        (turn, place), matrix = camera.pose, camera.matrix
+        assert matrix is not None
+        rotation: np.ndarray = exp_so3(solution.correction[None, 3:])[0] @ turn[0]
+        position = place[0] + solution.correction[:3]
+        body = joints @ rotation
+        ray = np.column_stack([keypoints[seen] - matrix[:2, 2], np.full(seen.sum(), 1.0)])
+        ray[:, :2] /= np.diagonal(matrix)[:2]
+        ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)) @ rotation
+        across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+        target = (across @ (position - body[seen])[..., None])[..., 0]
+        self._past.append((stamp_ns, across.mean(axis=0), target.mean(axis=0)))
+        sight = self._root(stamp_ns) - position
+        self._ranges[stamp_ns] = float(np.linalg.norm(sight))
+        while len(self._ranges) > _MOST_IMAGES:
+            self._ranges.popitem(last=False)
+        if self._solution is None:
+            return None
+        root = position + solution.factor * sight
+        return PlacedPose(root + body, _covariance(covariance, rotation, sight) + solution.place, rotation)
+
+    def _root(self, now_ns: int) -> np.ndarray:
+        """(3,) m, the pelvis now: least distances from all rays of the past, at a constant velocity."""
+        while not 0 <= now_ns - self._past[0][0] <= _PAST_NS:
+            self._past.popleft()
+        ago = np.array([(stamp - now_ns) * 1e-9 for stamp, _, _ in self._past])
+        across, target = (np.array([row[i] for row in self._past]) for i in (1, 2))
+        time = np.stack([np.ones(len(ago)), ago], axis=1)
+        matrix = np.einsum("fa,fb,fij->aibj", time, time, across).reshape(6, 6)
+        matrix[3:, 3:] += _ERROR_OVER_SPEED_S**2 * np.eye(3)
+        found: np.ndarray = np.linalg.lstsq(matrix, np.einsum("fa,fi->ai", time, target).reshape(6), rcond=1e-9)[0]
+        return found[:3]
+
+    def _factor(self, window: AdjustedWindow) -> float:
+        """Factor from the ranges found here to those of the window, over the images that both have."""
+        assert window.in_map is not None
+        ranges = np.linalg.norm(window.joints3d[:, 0] - window.in_map.position, axis=1)
+        both = [
+            there / self._ranges[stamp]
+            for stamp, there in zip(window.stamp_ns.tolist(), ranges.tolist(), strict=True)
+            if stamp in self._ranges
+        ]
+        return float(np.clip(np.median(both), *_FACTORS)) if both else 1.0
+
+    def _blended(self, stamp_ns: int) -> _Solution:
+        """The solution that holds at an image."""
+        assert self._solution is not None
+        passed = (stamp_ns - self._begin_ns) / self._blend_ns if self._blend_ns else 1.0
+        if self._before is None or passed >= 1.0:
+            return self._solution
+        share, old, new = max(passed, 0.0), self._before, self._solution
+        return _Solution(
+            (1.0 - share) * old.correction + share * new.correction,
+            (1.0 - share) * old.factor + share * new.factor,
+            (1.0 - share) * old.place + share * new.place,
+        )
+
+
+def _covariance(packed: np.ndarray, rotation: np.ndarray, sight: np.ndarray) -> np.ndarray:
+    """(P, 6) m^2 in ``map`` of a pose's covariances (P, 6) in camera axes, and of its place after the window.
+
+    Along the line of sight the place is as uncertain as the scale of a window in ``map`` may be at most.
+    """
+    along = np.outer(sight, sight)
+    place = _ACROSS_M**2 * (np.eye(3) - along / max(float(sight @ sight), 1e-12)) + MEASURED**2 * along
+    full = rotation.T @ unpack_covariance(packed) @ rotation + place
+    return np.asarray(full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+
 
 _BONES = BODY_17.bones
 

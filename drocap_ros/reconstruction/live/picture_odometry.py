@@ -23,8 +23,8 @@ from drocap_ros.geometry.rotations import exp_so3, hat, matrix_from_quaternion, 
 from drocap_ros.reconstruction.camera.from_picture import fits
 from drocap_ros.reconstruction.camera.fusion import joints_by_camera
 from drocap_ros.reconstruction.camera.growth import Grown, Growth, adjusted, turns
-from drocap_ros.reconstruction.camera.kinds import cut_at, kind_of
-from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ, Knots
+from drocap_ros.reconstruction.camera.kinds import Sightings, cut_at, kind_of
+from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ, Knots, views_of
 from drocap_ros.reconstruction.camera.picture_world import (
     HELD_M,
     metres_per_unit,
@@ -32,11 +32,9 @@ from drocap_ros.reconstruction.camera.picture_world import (
     seen_from_camera,
     with_camera,
 )
-from drocap_ros.reconstruction.camera.sightings import Sightings
 from drocap_ros.reconstruction.camera.upright import FEET_TELL, LEAST_SCALE_STD, by_contacts, set_upright
-from drocap_ros.reconstruction.camera.views import views_of
 from drocap_ros.reconstruction.common.poses import ImagePoses
-from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.common.windows import even_slots
 from drocap_ros.reconstruction.live.window import Retry, Window
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.placement import metres_per_px

@@ -10,9 +10,9 @@ from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.ellipsoids import pack_covariance, unpack_covariance
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.camera.growth import LEAST_POINTS
+from drocap_ros.reconstruction.camera.path_model import LEAST_VIEWS
 from drocap_ros.reconstruction.camera.picture_world import seen_from_camera
-from drocap_ros.reconstruction.camera.resection import LEAST_POINTS
-from drocap_ros.reconstruction.camera.views import LEAST_VIEWS
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.method import WindowSolution
@@ -25,7 +25,7 @@ from drocap_ros.reconstruction.live.picture_odometry import (
     own_covariance,
 )
 from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Window
-from drocap_ros.reconstruction.live.world_chain import WorldChain
+from drocap_ros.reconstruction.live.world_windows import WorldChain
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import place_in_world
 from drocap_ros.reconstruction.world.refine import RefinedWorld

@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Report
-from drocap_ros.reconstruction.common.stop_reason import TOO_SHORT
+from drocap_ros.reconstruction.common.poses import TOO_SHORT, ImagePoses, MethodInput, Report
 from drocap_ros.reconstruction.common.windows import over_windows, windows
 from drocap_ros.reconstruction.paper.bundle_adjustment import MIN_WINDOW, bundle_adjust
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, load_dictionary

@@ -17,9 +17,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import torso_frame
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.common.stop_reason import CONVERGED, ITERATIONS
-from drocap_ros.reconstruction.paper.articulation import articulation_term, articulation_value
-from drocap_ros.reconstruction.paper.nuclear_norm import nuclear_norm, singular_value_threshold
+from drocap_ros.reconstruction.common.poses import CONVERGED, ITERATIONS
 from drocap_ros.reconstruction.paper.reprojection import (
     Projection,
     frames_first,
@@ -28,6 +26,64 @@ from drocap_ros.reconstruction.paper.reprojection import (
     rotate,
 )
 from drocap_ros.reconstruction.paper.rotations import update_rotations
+from drocap_ros.skeleton import BODY_15, RIGID_BONES
+
+
+def nuclear_norm(s: np.ndarray) -> float:
+    """Sum of the singular values of S#, for shapes (..., F)."""
+    return float(_singular(s.reshape(-1, s.shape[-1]))[0].sum())
+
+
+def singular_value_threshold(s: np.ndarray, tau: float) -> tuple[np.ndarray, float]:
+    """Proximal step of ``tau * nuclear norm`` (Cai, Candes and Shen 2010) on shapes (..., F).
+
+    Returns
+    -------
+    shapes (..., F) and the nuclear norm of the result
+    """
+    m = s.reshape(-1, s.shape[-1])
+    sigma, u, wide = _singular(m)
+    kept = np.maximum(sigma - tau, 0.0)
+    shrink = (u * (kept / np.where(sigma > 0.0, sigma, 1.0))) @ u.T
+    return (shrink @ m if wide else m @ shrink).reshape(s.shape), float(kept.sum())
+
+
+def _singular(m: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Singular values and the vectors of the short side, from the Gram matrix: 3P is tens, F is hundreds."""
+    wide = m.shape[0] <= m.shape[1]
+    values, vectors = np.linalg.eigh(m @ m.T if wide else m.T @ m)
+    return np.sqrt(np.maximum(values, 0.0)), vectors, wide
+
+
+#: (L, 15) differences of joints: row l subtracts the upper end of limb l from its lower end.
+LIMBS = np.zeros((len(RIGID_BONES), len(BODY_15)))
+for _row, (_upper, _lower) in enumerate(RIGID_BONES):
+    LIMBS[_row, BODY_15.index(_upper)], LIMBS[_row, BODY_15.index(_lower)] = -1.0, 1.0
+
+
+def best_rank_one(lengths: np.ndarray) -> np.ndarray:
+    """The auxiliary matrix L (L, F): the closest matrix of rank 1, by SVD (of the L x L Gram matrix)."""
+    u = np.linalg.eigh(lengths @ lengths.T)[1][:, -1]
+    closest: np.ndarray = u[:, None] * (u @ lengths)
+    return closest
+
+
+def articulation_value(s: np.ndarray) -> float:
+    """``|l(S) - L|_F^2`` with L at its optimum: l(S) without its largest singular value."""
+    limbs = LIMBS @ s
+    lengths = np.einsum("ilf,ilf->lf", limbs, limbs)
+    excess = lengths - best_rank_one(lengths)
+    return float(np.vdot(excess, excess))
+
+
+def articulation_term(s: np.ndarray) -> tuple[float, np.ndarray]:
+    """Value and gradient (3, 15, F) of ``|l(S) - L|_F^2``; as L minimizes the term, it adds nothing to the gradient."""
+    limbs = LIMBS @ s
+    lengths = np.einsum("ilf,ilf->lf", limbs, limbs)
+    excess = lengths - best_rank_one(lengths)
+    limbs *= 4.0 * excess
+    return float(np.vdot(excess, excess)), LIMBS.T @ limbs
+
 
 #: Window length for which alpha is given: the protocol's 10 s at 24 fps.
 REFERENCE_FRAMES = 240

@@ -9,8 +9,7 @@ import numpy as np
 from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, sparse_code
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
-from drocap_ros.reconstruction.paper.sparse_fit import SparseFit, fit_sparse
-from drocap_ros.reconstruction.paper.viewpoint_search import search_viewpoints
+from drocap_ros.reconstruction.paper.viewpoint_search import SparseFit, fit_sparse, search_viewpoints
 
 #: Area over which gross outliers are uniform, squared 2D std: about that of the person's box.
 OUTLIER_AREA = 12.0

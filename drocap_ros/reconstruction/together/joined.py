@@ -14,7 +14,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.ellipsoids import pack_covariance, unpack_covariance
 from drocap_ros.motion import Motion
-from drocap_ros.reconstruction.common.threads import blas_threads
+from drocap_ros.reconstruction.common.engine import blas_threads
 from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.reconstruct import Solved
 from drocap_ros.reconstruction.together.placement import Placement, follow_view, place_view

@@ -9,12 +9,11 @@ import numpy as np
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.fusion import with_camera_errors
 from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.common.windows import even_slots
 from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
-from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.together.view import Doubt, View
-from drocap_ros.reconstruction.world.joined_views import Beside
-from drocap_ros.reconstruction.world.refine import RefinedWorld, refine_in_world
+from drocap_ros.reconstruction.world.refine import Beside, RefinedWorld, refine_in_world
 from drocap_ros.reconstruction.world.world_model import WorldInput
 
 #: Errors of a place and an attitude that the bodies of single views give: their depths err by a tenth of the range,

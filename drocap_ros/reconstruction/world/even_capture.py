@@ -11,8 +11,7 @@ from drocap_ros.contacts import ankles_seen
 from drocap_ros.geometry.interpolation import MAX_GAP_S
 from drocap_ros.geometry.rotations import project_to_so3
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.windows import fade_weights, windows
-from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.common.windows import even_slots, fade_weights, windows
 from drocap_ros.reconstruction.lifted.window_solver import difference_noise
 from drocap_ros.reconstruction.world.world_model import PlacedPoses
 

@@ -12,11 +12,10 @@ from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.refusal import Refusal
-from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.placement import WorldPoses, place_in_world
 from drocap_ros.reconstruction.world.refine import Before, RefinedWorld, refinable, refine_in_world
 from drocap_ros.reconstruction.world.telemetry_checks import upside_down
-from drocap_ros.reconstruction.world.world_model import PlacedPoses, WorldConfig
+from drocap_ros.reconstruction.world.world_model import Findings, PlacedPoses, WorldConfig
 from drocap_ros.skeleton import BODY_15
 
 _PELVIS = BODY_15.index("pelvis")

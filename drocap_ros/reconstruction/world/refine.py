@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +24,6 @@ from drocap_ros.reconstruction.world.even_capture import (
     capture_windows,
     even_capture,
 )
-from drocap_ros.reconstruction.world.findings import MEASURED, Findings
-from drocap_ros.reconstruction.world.joined_views import Beside, view_state
 from drocap_ros.reconstruction.world.telemetry_checks import (
     frozen,
     jump_m,
@@ -41,9 +39,11 @@ from drocap_ros.reconstruction.world.world_model import (
     CAMERA,
     GLOBALS,
     JOINTS,
+    MEASURED,
     MISALIGNMENT,
     POSITION_LATENCY,
     SCALE,
+    Findings,
     PlacedPoses,
     WorldConfig,
     WorldInput,
@@ -58,6 +58,38 @@ _LARGEST_COST = 100.0
 _LEAST_CONTACT = 0.03
 #: Frames per second below which a step of a foot ends between two frames: contacts are not seen.
 _CONTACTS_FPS = 8.0
+
+
+class Beside(NamedTuple):
+    """Other cameras' views of the same body at all slots of the even grid, in the same world.
+
+    placed_m, placed_deg : of the first view's own camera, as in :class:`WorldInput`
+    lengths : (18,) m of the body, of the spans; None = those of the poses to start from
+    """
+
+    views: tuple[WorldInput, ...] = ()
+    placed_m: float = 0.0
+    placed_deg: float = 0.0
+    lengths: np.ndarray | None = None
+
+    def window(self, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> tuple[WorldInput, ...]:
+        """The views at some slots, about an origin (3,) m."""
+        return tuple(_at_slots(view, rows, lengths, origin) for view in self.views)
+
+
+def _at_slots(view: WorldInput, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> WorldInput:
+    path = view.telemetry
+    return replace(
+        view,
+        keypoints=view.keypoints[rows],
+        weight=view.weight[rows],
+        depth=view.depth[rows],
+        depth_sigma=view.depth_sigma[rows],
+        seen=None if view.seen is None else view.seen[rows],
+        still=None if view.still is None else view.still[rows],
+        telemetry=CameraTelemetry(path.rotation[rows], path.position[rows] - origin, path.fps),
+        lengths=lengths,
+    )
 
 
 @dataclass(frozen=True)
@@ -223,8 +255,8 @@ class _Faded:
         self._weight = np.zeros(slots)
 
     def add(self, window: CaptureWindow, found: WorldSolution, data: WorldInput) -> None:
-        views = enumerate((data, *data.further))
-        cameras = np.stack([_correction(view_state(found.state, n), view.telemetry) for n, view in views], axis=1)
+        views = enumerate(data.views)
+        cameras = np.stack([_correction(found.state.of_view(n), view.telemetry) for n, view in views], axis=1)
         place = np.broadcast_to(found.place, (len(found.joints), 3, 3))
         values = found.joints, cameras, found.state.camera[:, :CAMERA], place, found.covariance + found.place
         for total, value in zip(self._sums, values, strict=True):

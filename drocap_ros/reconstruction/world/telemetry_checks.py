@@ -8,7 +8,7 @@ from drocap_ros.contacts import ANKLES, LOOKS_AT_REST, PLACED_REST_M_S, rest_lik
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
-from drocap_ros.reconstruction.world.metric_scale import STILL_M
+from drocap_ros.reconstruction.world.placement import STILL_M
 from drocap_ros.skeleton import BODY_15
 
 #: Time (s) for which the pose of a moving camera stays the same without a new measurement: reports come more often.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from drocap_ros.reconstruction.world.findings import MEASURED
+from drocap_ros.reconstruction.world.world_model import MEASURED
 
 #: Standard deviations from zero at which a correction is stated: 95 of 100 errors of nothing are smaller.
 _CLEAR = 2.0

@@ -9,30 +9,66 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.contacts import ANKLES, FEET, HEIGHT_STD_M, MOVING, MOVING_LOCKED, RestingFeet, step_height
-from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
-from drocap_ros.reconstruction.common.line_search import search_line
-from drocap_ros.reconstruction.common.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
-from drocap_ros.reconstruction.world.findings import Findings
-from drocap_ros.reconstruction.world.joined_views import JoinedViews, joined_state, joined_weights
-from drocap_ros.reconstruction.world.posterior import posterior
-from drocap_ros.reconstruction.world.world_equations import normal_matrix
+from drocap_ros.reconstruction.common.engine import Covariances, Equations, descend
+from drocap_ros.reconstruction.common.poses import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.world_model import (
     CALIBRATED,
     FLOOR,
     GLOBALS,
+    JOINTS,
     LENGTHS,
     MISALIGNMENT,
     SCALE,
+    Findings,
     WorldConfig,
     WorldInput,
     WorldState,
+    joint_columns,
 )
-from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, WorldWeights, gradient
+from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, weights_of
+
+
+class Posterior(NamedTuple):
+    """Covariances at a unit variance of every residual.
+
+    place : (3, 3) m^2 of the mean place of all joints of all frames, in the world
+    joints : (F, 17, 3, 3) m^2 about it; shared : of the shared unknowns
+    """
+
+    place: np.ndarray
+    joints: np.ndarray
+    shared: np.ndarray
+
+
+def posterior(equations: Equations, state: WorldState) -> Posterior | None:
+    """Covariances from the equations at the solution; None = not positive definite."""
+    found = Covariances.of(equations)
+    if found is None:
+        return None
+    frames, scale, size = len(state.joints), float(state.globals[SCALE]), len(found.shared)
+    cameras = state.camera.shape[1]
+    lever = found.lever.reshape(frames, -1, size)[:, cameras:].reshape(frames, JOINTS, 3, -1) / scale
+    lever[..., SCALE] += state.joints / scale**2
+    joints = np.empty((frames, JOINTS, 3, 3))
+    blocks, _ = found.blocks(cameras + 3 * JOINTS, np.float32)
+    for joint in range(JOINTS):
+        at = slice(cameras + 3 * joint, cameras + 3 * joint + 3)
+        joints[:, joint] = blocks[:, at, at] / scale**2
+    weighted = (lever.reshape(-1, size) @ found.shared).reshape(lever.shape)
+    joints += weighted @ np.swapaxes(lever, -1, -2)
+    # Of the joints with their mean place.
+    mean = np.zeros((frames, cameras + 3 * JOINTS, 3))
+    mean[:, cameras:] = np.tile(np.eye(3), (JOINTS, 1)) / (frames * JOINTS * scale)
+    own = found.of_frames(mean.reshape(-1, 3)).reshape(mean.shape)[:, cameras:] / scale
+    with_place = own.reshape(frames, JOINTS, 3, 3) + lever @ (found.shared @ lever.mean(axis=(0, 1)).T)
+    place = with_place.mean(axis=(0, 1))
+    return Posterior(place, joints - with_place - np.swapaxes(with_place, -1, -2) + place, found.shared)
+
 
 #: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 1e-4
@@ -86,19 +122,7 @@ def initial_state(data: WorldInput, start: WorldState) -> WorldState:
     shared = start.globals.copy()
     shared[LENGTHS] = data.lengths
     shared[FLOOR] = np.percentile(start.joints[:, ANKLES, 2], 10)
-    return joined_state(WorldState(start.joints, start.camera, shared), len(data.further))
-
-
-#: Residuals of one view, or of several of the same body.
-_Residuals: TypeAlias = WorldResiduals | JoinedViews
-
-
-def _residuals(
-    data: WorldInput, weights: tuple[WorldWeights, ...], state: WorldState, contacts: Contacts
-) -> _Residuals:
-    if data.further:
-        return JoinedViews(data, weights, state, contacts)
-    return WorldResiduals(data, weights[0], state, contacts)
+    return WorldState(start.joints, start.camera, shared).with_views(len(data.further))
 
 
 class _Stage(NamedTuple):
@@ -141,12 +165,12 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
     start : its lengths and floor do not matter
     held : so many frames at the begin keep their joints and their camera's errors
     """
-    config, weights = data.config, joined_weights(data)
+    config, weights = data.config, weights_of(data)
     state = initial_state(data, start)
     stop, done, ground, floor_std = ITERATIONS, 0, float("nan"), HEIGHT_STD_M
     contact: np.ndarray = np.zeros((len(start.joints) - 1, len(FEET)))
-    outlier = _residuals(data, weights, state, Contacts(contact, 0.0)).usual_outlier()
-    seen = np.any([view.weight > 0 if view.seen is None else view.seen for view in (data, *data.further)], axis=0)
+    outlier = WorldResiduals(data, weights, state, Contacts(contact, 0.0)).usual_outlier()
+    seen = np.any([view.weight > 0 if view.seen is None else view.seen for view in data.views], axis=0)
     feet = RestingFeet(seen, data.fps, _still(data), start.joints)
     for stage in _stages(config, held):
         done += 1
@@ -155,7 +179,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         if stage.finds_floor:
             ground = _ground_spread(state, contact)
             floor_std = _floor_std(ground)
-        here = _residuals(data, weights, state, Contacts(contact, stage.weight, outlier, floor_std))
+        here = WorldResiduals(data, weights, state, Contacts(contact, stage.weight, outlier, floor_std))
         there = _improved(here, held, stage.locking)
         if there is None:
             stop = NO_DESCENT
@@ -164,60 +188,49 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         if stage.locking and here.cost - there.cost <= _CONVERGED * here.cost:
             stop = CONVERGED
             break
-    final = _residuals(data, weights, state, Contacts(contact, config.contact_weight, floor_std=floor_std))
+    final = WorldResiduals(data, weights, state, Contacts(contact, config.contact_weight, floor_std=floor_std))
     return _solution(final, ground, done, stop)
 
 
 def _still(data: WorldInput) -> np.ndarray | None:
     """(F, 2) probability that a foot rests, the mean of the views'."""
-    known = [view.still for view in (data, *data.further) if view.still is not None]
+    known = [view.still for view in data.views if view.still is not None]
     return np.mean(known, axis=0) if known else None
 
 
-def _equations(here: _Residuals) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Gradient and normal matrix."""
-    if isinstance(here, JoinedViews):
-        return here.gradient(), here.normal_matrix()
-    return gradient(here), normal_matrix(here)
-
-
-def _improved(here: _Residuals, held: int, locking: bool) -> _Residuals | None:
+def _improved(here: WorldResiduals, held: int, locking: bool) -> WorldResiduals | None:
     """The point after one step of Gauss-Newton, shortened until the cost falls; None = there is none."""
-    (frames, shared), matrix = _equations(here)
-    matrix[0][: held * frames.shape[1], 0] += _HOLD
-    step = _solve(matrix, frames, shared, locking)
-    if step is None:
-        return None
-    slope = float((frames * step[0]).sum() + shared @ step[1])
+    equations = here.equations()
+    equations.band[: held * joint_columns(len(here.views)).stop, 0] += _HOLD
 
-    def moved(share: float) -> _Residuals | None:
-        there = here.moved(share * step[0], share * step[1])
+    def moved(frames: np.ndarray, shared: np.ndarray) -> WorldResiduals | None:
+        there = here.moved(frames, shared)
         return there if there.state.globals[SCALE] > _LEAST_SCALE else None
 
-    return cast("_Residuals | None", search_line(here.cost, slope, moved))
+    return descend(here, equations, moved, locking)
 
 
-def _solution(final: _Residuals, ground: float, iterations: int, stop_reason: str) -> WorldSolution:
+def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason: str) -> WorldSolution:
     """The solution with its errors, by the posterior covariance where the normal equations have one."""
     data, state = final.data, final.state
-    weights = final.weights[0] if isinstance(final, JoinedViews) else final.weights
+    prior, expected = final.weights.shared[:GLOBALS, :GLOBALS], final.weights.expected[:GLOBALS]
     fact = data.config.frames_per_fact
-    known = _with_terms_that_last(final) if data.config.corrected and isinstance(final, WorldResiduals) else final
-    found = posterior(_equations(known)[1], state)
+    known = _with_terms_that_last(final) if data.config.corrected and not data.further else final
+    found = posterior(known.equations(), state)
     axes = data.telemetry.gimbal_axes()
     std, turned_std = np.full(GLOBALS, np.nan), np.full(3, np.nan)
     place: np.ndarray = np.full((3, 3), np.nan)
     covariance = np.full((*state.joints.shape, 3), np.nan)
     findings = Findings.unknown()
     if found is not None:
-        prior = np.sqrt(fact * np.diag(np.linalg.inv(weights.shared)))
+        widest = np.sqrt(fact * np.diag(np.linalg.inv(prior)))
         shared = found.shared[:GLOBALS, :GLOBALS]
-        std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(shared)), prior)
+        std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(shared)), widest)
         place, covariance = fact * found.place, fact * found.joints
         turns = _STD_FACTOR**2 * fact * axes @ shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
-        least = fact * axes @ np.linalg.inv(weights.shared[MISALIGNMENT, MISALIGNMENT]) @ axes.T
+        least = fact * axes @ np.linalg.inv(prior[MISALIGNMENT, MISALIGNMENT]) @ axes.T
         turned_std = np.sqrt(np.minimum(np.diag(turns), np.diag(least)))
-        findings = _findings(fact * shared, weights.shared / fact, weights.expected, state.globals[:GLOBALS])
+        findings = _findings(fact * shared, prior / fact, expected, state.globals[:GLOBALS])
     return WorldSolution(
         joints=state.joints / state.globals[SCALE],
         state=state,
@@ -242,11 +255,8 @@ def _with_terms_that_last(final: WorldResiduals) -> WorldResiduals:
     points these terms stay wide: a camera that is turned wrongly bends them all in the same way.
     """
     fact, weights = final.data.config.frames_per_fact, final.weights
-    weights = weights._replace(
-        acceleration=fact * weights.acceleration,
-        camera_acceleration=fact * weights.camera_acceleration,
-        depth=fact * weights.depth,
-    )
+    views = tuple(v._replace(acceleration=fact * v.acceleration, depth=fact * v.depth) for v in weights.views)
+    weights = weights._replace(acceleration=fact * weights.acceleration, views=views)
     contact, weight, _, floor_std = final.contacts
     wide = Contacts(contact, fact * weight, floor_std=floor_std / float(np.sqrt(fact)))
     return WorldResiduals(final.data, weights, final.state, wide)
@@ -278,25 +288,3 @@ def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, a
         (after - before) / _STD_FACTOR**2,
         (after @ point[CALIBRATED] - before @ expected[CALIBRATED]) / _STD_FACTOR**2,
     )
-
-
-def _solve(
-    matrix: tuple[np.ndarray, np.ndarray, np.ndarray],
-    frames: np.ndarray,
-    shared: np.ndarray,
-    fixed: bool,
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Step of the frames' and the shared unknowns; None = not positive definite.
-
-    fixed : the shared unknowns stay as they are
-    """
-    band, border, corner = matrix
-    factor = band_factor(band)
-    if factor is None:
-        return None
-    if fixed:
-        return backward(factor, forward(factor, -frames.reshape(-1, 1))).reshape(frames.shape), np.zeros(len(shared))
-    y = forward(factor, np.concatenate([-frames.reshape(-1, 1), border], axis=1))
-    square = y.T @ y
-    step = np.linalg.solve(corner - square[1:, 1:], -shared - square[1:, 0])
-    return backward(factor, y[:, :1] - y[:, 1:] @ step[:, None]).reshape(frames.shape), step

@@ -7,6 +7,7 @@ scale enters through the camera's position alone, and no term that prefers littl
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,16 +15,59 @@ from drocap_ros.camera_path import CameraErrors, CameraPath
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, ShiftedPath
-from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.skeleton import BODY_15, BODY_17
+
+#: Relative standard deviation of the scale below which it counts as measured: half of that among people.
+MEASURED = 0.03
+#: Time (s) after which findings count a third: telemetry drifts, and errors of the poses do not average out.
+_MEMORY_S = 60.0
+
+
+class Findings(NamedTuple):
+    """Of the measurements alone: precision (6, 6) and vector (6,); zeros = nothing is known.
+
+    The unknowns are the logarithm of the scale, the misalignment (3) rad, the latencies of attitude and position s; of
+    points the latter five first, then the logarithm of the focal length.
+    """
+
+    precision: np.ndarray
+    vector: np.ndarray
+
+    @staticmethod
+    def unknown() -> Findings:
+        """Nothing is known."""
+        return Findings(np.zeros((6, 6)), np.zeros(6))
+
+    def later(self, found: Findings, share: float, passed_s: float) -> Findings:
+        """Findings ``passed_s`` later, with a share of those of a window: its frames that the next one has not."""
+        decay = float(np.exp(-passed_s / _MEMORY_S))
+        return Findings(
+            decay * (self.precision + share * found.precision), decay * (self.vector + share * found.vector)
+        )
+
+    def of_scale(self) -> Findings:
+        """What they tell of the scale alone, where the camera's reports have other errors than until now."""
+        rest = self.precision[1:, 0] @ np.linalg.pinv(self.precision[1:, 1:])
+        alone = Findings.unknown()
+        alone.precision[0, 0] = self.precision[0, 0] - rest @ self.precision[1:, 0]
+        alone.vector[0] = self.vector[0] - rest @ self.vector[1:]
+        return alone
+
+    def after(self, found: Findings, its_ns: np.ndarray, stamp_ns: np.ndarray) -> Findings:
+        """Findings before a window of ``stamp_ns``, with those of the window of ``its_ns`` that it has not itself."""
+        begin, end = int(its_ns[0]), int(its_ns[-1])
+        share = float(np.clip((int(stamp_ns[0]) - begin) / max(end - begin, 1), 0.0, 1.0))
+        return self.later(found, share, max(int(stamp_ns[-1]) - end, 0) * 1e-9)
+
 
 JOINTS = len(BODY_17)
 #: Bones whose total length is the unit: those without the feet.
 BONES = len(BODY_15.bones)
 SPAN_STD_M = SPAN_STD_MM / 1000.0
-#: Unknowns of one frame: position error (3), rotation error (3) of the camera, joints.
+#: Standard deviation (m) of the body's total bone length, which sets the unit: less than any other term feels.
+GAUGE_M = 0.0005
+#: Unknowns of one frame and camera: position error (3), rotation error (3).
 CAMERA = 6
-FRAME = CAMERA + 3 * JOINTS
 #: The unknowns of the whole recording, in this order.
 LENGTHS = slice(0, len(SPANS))
 FLOOR = LENGTHS.stop
@@ -32,10 +76,22 @@ MISALIGNMENT = slice(SCALE + 1, SCALE + 4)
 ATTITUDE_LATENCY = MISALIGNMENT.stop
 POSITION_LATENCY = ATTITUDE_LATENCY + 1
 GLOBALS = POSITION_LATENCY + 1
-#: Those of every camera; each further view of the same body has its own, behind ``GLOBALS``.
+#: Those of every camera; each further view of the same body has its own ones, behind ``GLOBALS``.
 OF_VIEW = slice(MISALIGNMENT.start, GLOBALS)
-#: The unknowns of a :class:`~drocap_ros.reconstruction.world.findings.Findings`.
+OWN = OF_VIEW.stop - OF_VIEW.start
+#: The unknowns of a :class:`~drocap_ros.reconstruction.world.world_model.Findings`.
 CALIBRATED = slice(SCALE, GLOBALS)
+
+
+def joint_columns(views: int) -> slice:
+    """Places of the joints among the unknowns of a frame: behind the errors of every view's camera."""
+    return slice(CAMERA * views, CAMERA * views + 3 * JOINTS)
+
+
+def shared_columns(view: int) -> np.ndarray:
+    """(GLOBALS,) places of the unknowns that a view has, in their order, among the shared ones."""
+    own = np.arange(OF_VIEW.start, GLOBALS) + OWN * view
+    return np.concatenate([np.arange(OF_VIEW.start), own])
 
 
 @dataclass(frozen=True)
@@ -144,6 +200,11 @@ class WorldInput:
         """Frames per second."""
         return self.telemetry.fps
 
+    @property
+    def views(self) -> tuple[WorldInput, ...]:
+        """The first view, which is this one, and the further ones."""
+        return (self, *self.further)
+
 
 @dataclass(frozen=True)
 class WorldState:
@@ -163,8 +224,19 @@ class WorldState:
         """The telemetry shifted by the latencies, without the other errors."""
         return telemetry.shifted(float(self.globals[ATTITUDE_LATENCY]), float(self.globals[POSITION_LATENCY]))
 
+    def of_view(self, number: int) -> WorldState:
+        """The point as one view has it."""
+        own = shared_columns(number)
+        return WorldState(self.joints, self.camera[:, CAMERA * number : CAMERA * (number + 1)], self.globals[own])
+
+    def with_views(self, further: int) -> WorldState:
+        """A point of one view with as many further ones, whose cameras stand where they were placed."""
+        errors = np.zeros((len(self.joints), CAMERA * further))
+        camera, shared = np.concatenate([self.camera, errors], axis=1), np.append(self.globals, np.zeros(OWN * further))
+        return WorldState(self.joints, camera, shared)
+
     def moved(self, frames: np.ndarray, shared: np.ndarray) -> WorldState:
-        """The point after a step of the frames' unknowns (F, FRAME) and of the shared ones (GLOBALS,)."""
+        """The point after a step of the frames' unknowns, as of :func:`joint_columns`, and of the shared ones."""
         cameras = self.camera.shape[1]
         joints = self.joints + frames[:, cameras:].reshape(self.joints.shape)
         return WorldState(joints, self.camera + frames[:, :cameras], self.globals + shared)

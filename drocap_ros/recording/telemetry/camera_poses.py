@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.frames import camera_rotation, quaternion_from_euler
+from drocap_ros.flight.vehicle_state import camera_rotation, quaternion_from_euler
 from drocap_ros.geometry.interpolation import interpolate, true_runs
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.geometry.rotations import quaternion_multiply

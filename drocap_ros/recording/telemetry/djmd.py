@@ -5,30 +5,33 @@ One protobuf message belongs to each image.  The format is not published: values
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import orientation_to_ros
+from drocap_ros.flight.vehicle_state import orientation_to_ros
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.recording.telemetry import djmd_layouts as layouts
 from drocap_ros.recording.telemetry.djmd_layouts import Layout, Model
 from drocap_ros.recording.telemetry.log import Lack, Lens, LogFormat, LogLack, TelemetryLog, make_log
-from drocap_ros.recording.telemetry.mp4 import Samples, Track, read_samples, read_tracks
 from drocap_ros.recording.telemetry.plausibility import Series, plausible
 from drocap_ros.recording.telemetry.protobuf import Message, Value
 from drocap_ros.recording.telemetry.series import dji_attitude, from_first_fix
 from drocap_ros.recording.telemetry.srt import TEXT_TRACKS, read_srt
+from drocap_ros.recording.telemetry.video_tracks import find_track, read_samples
+from drocap_ros.tracks import MAX_FRAMES
 
 #: Format of the track's samples.
-_SAMPLES = "djmd"
+_FORMAT = "djmd"
 #: Bytes of a message; known ones have some kilobytes.
 _MAX_MESSAGE = 1 << 18
 _MIN_MESSAGE = 4  # bytes: a field's key, its length and a message of one value
 #: Messages from which the layout is found.
 _PROBED = 32
+_FIRST = 4  # the header stands in one of these
 #: Units of the file: angles in tenths of a degree, heights in mm; ExifTool's DJI tags.
 _TENTH_DEG = 0.1
 _MM = 1e-3  # m; of the file's heights
@@ -45,17 +48,10 @@ _TURN_DEG = 90.0
 _COLUMNS = (3, 6, 10, 13, 15, 16)
 
 
-def _find_track(file: IO[bytes]) -> Track | None:
-    """The telemetry track of an open video file, else its subtitles, None where there is none."""
-    tracks = {track.sample_format: track for track in read_tracks(file)}
-    return next((tracks[kind] for kind in (_SAMPLES, *TEXT_TRACKS) if kind in tracks), None)
-
-
 def has_djmd(path: Path) -> bool:
-    """Whether a file is a video with such a track."""
+    """Whether a file is a video with such a track, or with subtitles."""
     try:
-        with path.open("rb") as file:
-            return _find_track(file) is not None
+        return find_track(path, (_FORMAT, *TEXT_TRACKS)) is not None
     except OSError:
         return False
 
@@ -70,40 +66,57 @@ def read_djmd(path: Path) -> TelemetryLog:
     OSError
         When the file cannot be read.
     """
-    with path.open("rb") as file:
-        track = _find_track(file)
-        if track is None:
-            raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
-        if track.sample_format in TEXT_TRACKS:
-            return read_srt(path)
-        try:
-            samples = _in_order(read_samples(file, track))
-        except InputError as error:
-            raise InputError(f"{path}: djmd track: {error}; copy the file again") from None
-        return _to_log(path, file, samples)
-
-
-def _in_order(samples: Samples) -> Samples:
-    """The samples that can hold a message, at times that increase."""
-    fits = (samples.size >= _MIN_MESSAGE) & (samples.size <= _MAX_MESSAGE)
-    fits &= np.diff(samples.stamp_ns, prepend=-1) > 0
-    if fits.sum() < 0.5 * len(fits) or not fits.any():
-        raise InputError(f"expected messages at times that increase, found {fits.sum()} of {len(fits)} samples")
-    return Samples(samples.offset[fits], samples.size[fits], samples.stamp_ns[fits])
-
-
-def _message(file: IO[bytes], samples: Samples, index: int) -> Message | None:
-    file.seek(int(samples.offset[index]))
+    found = find_track(path, (_FORMAT, *TEXT_TRACKS))
+    if found is None:
+        raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
+    if found[1] != _FORMAT:
+        return read_srt(path)
     try:
-        return Message(file.read(int(samples.size[index])))
+        return _to_log(path, found[0])
+    except InputError as error:
+        words = str(error)
+        raise InputError(
+            words if words.startswith(str(path)) else f"{path}: djmd track: {words}; copy it again"
+        ) from None
+
+
+def _samples(path: Path, number: int) -> Iterator[tuple[int, bytes]]:
+    """Samples that can hold a message, at times that increase."""
+    count = fit = 0
+    last_ns = -1
+    for stamp_ns, data in itertools.islice(read_samples(path, number), MAX_FRAMES):
+        count += 1
+        if _MIN_MESSAGE <= len(data) <= _MAX_MESSAGE and stamp_ns > last_ns:
+            fit, last_ns = fit + 1, stamp_ns
+            yield stamp_ns, data
+    if fit < 0.5 * count or not fit:
+        raise InputError(f"expected messages at times that increase, found {fit} of {count} samples")
+
+
+def _message(data: bytes) -> Message | None:
+    try:
+        return Message(data)
     except ValueError:
         return None
 
 
-def _to_log(path: Path, file: IO[bytes], samples: Samples) -> TelemetryLog:
-    count = len(samples.stamp_ns)
-    probed = np.unique(np.concatenate([np.arange(min(count, 4)), np.linspace(0, count - 1, _PROBED).astype(int)]))
-    messages = [m for i in probed if (m := _message(file, samples, int(i))) is not None]
+def _probe(path: Path, number: int) -> tuple[np.ndarray, list[Message]]:
+    """Times of all samples, and messages from the begin to the end, however long the track is."""
+    stamps: list[int] = []
+    probed: list[bytes] = []
+    step = 1
+    for i, (stamp_ns, data) in enumerate(_samples(path, number)):
+        stamps.append(stamp_ns)
+        if i % step == 0:
+            probed.append(data)
+            if len(probed) >= 2 * _PROBED:
+                probed, step = [*probed[:_FIRST], *probed[_FIRST::2]], 2 * step
+    return np.array(stamps, np.int64), [message for data in probed if (message := _message(data)) is not None]
+
+
+def _to_log(path: Path, number: int) -> TelemetryLog:
+    stamp_ns, messages = _probe(path, number)
+    count = len(stamp_ns)
     name = _schema_name(messages)
     model = layouts.MODELS.get(name)
     layout = layouts.find_layout(messages, model)
@@ -113,16 +126,15 @@ def _to_log(path: Path, file: IO[bytes], samples: Samples) -> TelemetryLog:
             f" {name or 'without a name'}); give a log beside the video with --telemetry"
         )
     rows = np.full((count, _COLUMNS[-1]), np.nan)
-    for i in range(count):
-        message = _message(file, samples, i)
-        if message is not None:
+    for i, (_, data) in zip(range(count), _samples(path, number), strict=False):
+        if (message := _message(data)) is not None:
             rows[i] = _numbers_of(message, layout, model)
     damaged = int(np.isnan(rows).all(axis=1).sum())
     if damaged > 0.5 * count:
         raise InputError(f"{path}: expected djmd messages, found {damaged} of {count} damaged; copy the file again")
     lacks = [LogLack(Lack.DAMAGED_STATES, str(damaged))] if damaged else []
     with np.errstate(all="ignore"):  # damaged numbers may be infinite
-        return _from_rows(path, samples.stamp_ns, rows, (name, model), lacks)
+        return _from_rows(path, stamp_ns, rows, (name, model), lacks)
 
 
 def _schema_name(messages: list[Message]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler
+from drocap_ros.flight.vehicle_state import orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.geometry.interpolation import interpolate
 

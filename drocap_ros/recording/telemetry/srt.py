@@ -19,8 +19,8 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.telemetry.log import Lack, Lens, LogFormat, LogLack, TelemetryLog, make_log
-from drocap_ros.recording.telemetry.mp4 import read_samples, read_tracks
 from drocap_ros.recording.telemetry.series import dji_attitude, from_first_fix
+from drocap_ros.recording.telemetry.video_tracks import find_track, read_samples
 from drocap_ros.tracks import MAX_FRAMES
 
 #: Formats of a video's subtitle tracks (3GPP TS 26.245, QuickTime).
@@ -101,12 +101,9 @@ def _geodetic(places: np.ndarray) -> np.ndarray:
 
 def _inside(path: Path) -> Iterator[tuple[int, str]]:
     """Time ns and text of each sample of a video's subtitle track: two bytes of length, then the text."""
-    with path.open("rb") as file:
-        for track in [track for track in read_tracks(file) if track.sample_format in TEXT_TRACKS][:1]:
-            for offset, size, stamp_ns in zip(*(a.tolist() for a in read_samples(file, track)), strict=True):
-                file.seek(offset)
-                data = file.read(min(size, _LINE))
-                yield stamp_ns, data[2 : 2 + int.from_bytes(data[:2], "big")].decode("utf-8", errors="replace")
+    if found := find_track(path, TEXT_TRACKS):
+        for stamp_ns, data in read_samples(path, found[0]):
+            yield stamp_ns, data[2 : 2 + int.from_bytes(data[:2], "big")][:_LINE].decode("utf-8", errors="replace")
 
 
 def _subtitles(path: Path) -> Iterator[tuple[int, str]]:

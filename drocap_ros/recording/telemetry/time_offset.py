@@ -18,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.vehicle_state import camera_rotation
 from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.recording.telemetry.camera_poses import camera_attitude
 from drocap_ros.recording.telemetry.log import TelemetryLog, VehicleTrack
-from drocap_ros.recording.telemetry.mp4 import creation_time_ns, duration_s
+from drocap_ros.recording.telemetry.video_tracks import stated_times
 
 #: Sampling rate of the correlation.
 RATE_HZ = 10.0
@@ -104,7 +104,7 @@ def find_offset(
 
 
 def _offset_by_creation(video: Path, log: TelemetryLog) -> float | None:
-    created_ns = creation_time_ns(video)
+    created_ns, _ = stated_times(video)
     if created_ns is None or log.utc_minus_stamp_ns is None:
         return None
     seconds = (created_ns - log.utc_minus_stamp_ns - int(log.track.stamp_ns[0])) * 1e-9
@@ -114,7 +114,7 @@ def _offset_by_creation(video: Path, log: TelemetryLog) -> float | None:
 
 def _offset_by_part(video: Path, log: TelemetryLog, created_s: float | None) -> float | None:
     """Start of the part of the log that lasts as long as the video; of several the one nearest the creation time."""
-    length_s = duration_s(video)
+    _, length_s = stated_times(video)
     starts = [
         (first - int(log.track.stamp_ns[0])) * 1e-9
         for first, last in log.video_parts

@@ -8,10 +8,8 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.image_files import encode_jpeg
-from drocap_ros.simulation.render.background import draw_background, draw_shadow
-from drocap_ros.simulation.render.body import Look, body, dress
-from drocap_ros.simulation.render.quadrics import Layer, Quadrics, rasterize
-from drocap_ros.simulation.render.scenery import Scenery, make_scenery
+from drocap_ros.simulation.render.body import Layer, Look, Quadrics, body, dress, rasterize
+from drocap_ros.simulation.render.scenery import Scenery, draw_background, draw_shadow, make_scenery
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Larger images, in px, have a background of half the resolution, for speed; haze and blur hide it.

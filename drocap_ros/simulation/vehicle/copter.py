@@ -11,11 +11,10 @@ import math
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.frames import ned_to_enu
 from drocap_ros.flight.mavlink.transport import Transport
-from drocap_ros.simulation.vehicle.autopilot_control import manner_of
+from drocap_ros.flight.vehicle_state import ned_to_enu
 from drocap_ros.simulation.vehicle.copter_reports import EKF_NOTICED_S, CopterSetup, ReportingCopter
-from drocap_ros.simulation.vehicle.flight_control import Target
+from drocap_ros.simulation.vehicle.flight_control import Target, manner_of
 
 _STEP_S = 0.01  # of the body and the loops
 _SETUP = CopterSetup()

@@ -9,15 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.frames import enu_to_ned
 from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.flight.vehicle_state import enu_to_ned
 from drocap_ros.geometry.rotations import quaternion_multiply
-from drocap_ros.simulation.vehicle.autopilot_control import control_of
-from drocap_ros.simulation.vehicle.dynamics import Body
-from drocap_ros.simulation.vehicle.estimate_error import EstimateError
-from drocap_ros.simulation.vehicle.flight_control import FlightControl
-from drocap_ros.simulation.vehicle.flight_path import VehiclePose
-from drocap_ros.simulation.vehicle.mavlink_vehicle import ESTIMATOR_HEALTHY, Encode, SimulatedVehicle
+from drocap_ros.simulation.vehicle.dynamics import Body, EstimateError
+from drocap_ros.simulation.vehicle.flight_control import FlightControl, control_of
+from drocap_ros.simulation.vehicle.mavlink_vehicle import ESTIMATOR_HEALTHY, Encode, SimulatedVehicle, VehiclePose
 from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
 
 _GPS_NOTICED_S = 0.4  # from the loss of satellites to its report: measured

@@ -5,7 +5,15 @@ from __future__ import annotations
 import heapq
 import itertools
 import random
+import socket
 from collections.abc import Callable
+
+
+def free_udp_port() -> int:
+    """A free UDP port on loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 class Channel:

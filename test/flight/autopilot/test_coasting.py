@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.flight.autopilot.autopilot import greatest_speed
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint
+from drocap_ros.flight.orbit.speed import greatest_speed
 
 ARDUPILOT = [f"bridge_killed_timeout_{timeout}s_{i}" for timeout, n in (("0.3", 3), ("0.5", 5)) for i in range(n)]
 PX4 = [f"px4_bridge_sigkill_{i}" for i in range(3)]

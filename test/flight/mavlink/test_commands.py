@@ -9,16 +9,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.autopilot import AUTOPILOTS
 from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
+from drocap_ros.flight.autopilot.coasting import Setpoint, hold_setpoint
 from drocap_ros.flight.autopilot.px4 import PX4
-from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.frames import ned_to_enu
-from drocap_ros.flight.mavlink.commands import CommandQueue
+from drocap_ros.flight.mavlink.commands import CommandQueue, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.messages import halt_message, setpoint_message
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.transport import LinkError
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
+from drocap_ros.flight.vehicle_state import ned_to_enu
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 MAV = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)

@@ -16,14 +16,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import InputError, ParameterError
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.mavlink.commands import TELEMETRY
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.messages import TELEMETRY
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.mavlink.transport import open_transport
-from drocap_ros.simulation.vehicle.flight_path import orbit_path
-from drocap_ros.simulation.vehicle.mavlink_vehicle import HOME, SimulatedVehicle
+from drocap_ros.flight.vehicle_state import camera_rotation
+from drocap_ros.simulation.vehicle.mavlink_vehicle import HOME, SimulatedVehicle, orbit_path
 
 S = 1_000_000_000
 _TIOCGEXCL = 0x80045440  # ioctl of Linux: whether a terminal is used exclusively

@@ -8,8 +8,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.frames import orientation_to_aviation, orientation_to_ros, quaternion_from_euler
 from drocap_ros.flight.mavlink.mount import Mount
+from drocap_ros.flight.vehicle_state import orientation_to_aviation, orientation_to_ros, quaternion_from_euler
 
 S = 1_000_000_000
 #: As ArduPilot sends it for every mount: roll and pitch "locked", yaw from the nose.

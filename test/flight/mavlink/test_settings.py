@@ -5,7 +5,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.mavlink.settings import AutopilotSettings
+from drocap_ros.flight.mavlink.telemetry_request import AutopilotSettings
 from drocap_ros.flight.orbit.motion_checks import loss_condition
 from drocap_ros.flight.orbit.states import Action, State
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config

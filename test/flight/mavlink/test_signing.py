@@ -7,12 +7,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.commands import halt_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.messages import halt_message
 from drocap_ros.flight.mavlink.parser import MavlinkParser, read_signing_key, sign_with, signing_time
-from drocap_ros.simulation.vehicle.flight_path import orbit_path
-from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
-from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.simulation.vehicle.loopback import free_udp_port
+from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle, orbit_path
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
 NOW_NS = 1_800_000_000_000_000_000

@@ -7,7 +7,7 @@ from orbit_observations import GOOD, LIMITS, LOITER, changed, orbiting
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.telemetry_request import LinkStatus
 from drocap_ros.flight.orbit.safety import reduce
-from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
+from drocap_ros.flight.orbit.states import Action, Command, Idle, ModeRequest, State
 
 CRITICAL = 5
 
@@ -18,7 +18,7 @@ def test_every_state_of_emergency_holds_and_forbids_a_start():
         state, decision = reduce(orbiting(), seen, 1.0, None, LIMITS)
         assert (state.state, state.condition.code) == (State.HOLDING, ConditionCode.AUTOPILOT_EMERGENCY)
         assert decision.action == Action.HOLD
-        _, decision = reduce(SafetyState(), seen, 1.0, Command.START, LIMITS)
+        _, decision = reduce(Idle(), seen, 1.0, Command.START, LIMITS)
         assert (decision.answer.accepted, decision.answer.condition.code) == (False, state.condition.code)
 
 
@@ -27,23 +27,23 @@ def test_a_critical_state_forbids_a_start_and_ends_no_orbit():
     state, decision = reduce(orbiting(), seen, 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
     for command in (Command.START, Command.ENGAGE):
-        state, decision = reduce(SafetyState(), seen, 1.0, command, LIMITS)
+        state, decision = reduce(Idle(), seen, 1.0, command, LIMITS)
         assert (state.state, decision.answer.accepted) == (State.IDLE, False)
         assert decision.answer.condition.code == ConditionCode.AUTOPILOT_CRITICAL
-    assert reduce(SafetyState(), changed(seen, system_status=4), 1.0, None, LIMITS)[0].state == State.READY
+    assert reduce(Idle(), changed(seen, system_status=4), 1.0, None, LIMITS)[0].state == State.READY
 
 
 def test_a_critical_state_of_the_failsafe_for_lost_setpoints_alone_lets_an_orbit_begin():
     own = changed(LOITER, autopilot="px4", mode="LOITER", in_hold=True, left_by_itself=True, system_status=CRITICAL)
-    assert reduce(SafetyState(), own, 1.0, Command.ENGAGE, LIMITS)[1].answer.accepted
+    assert reduce(Idle(), own, 1.0, Command.ENGAGE, LIMITS)[1].answer.accepted
     for other in ({"left_by_itself": False}, {"in_hold": False}):
-        answer = reduce(SafetyState(), changed(own, **other), 1.0, Command.ENGAGE, LIMITS)[1].answer
+        answer = reduce(Idle(), changed(own, **other), 1.0, Command.ENGAGE, LIMITS)[1].answer
         assert (answer.accepted, answer.condition.code) == (False, ConditionCode.AUTOPILOT_CRITICAL)
 
 
 def test_no_mode_is_requested_in_a_hold_of_the_autopilot_that_another_failsafe_may_fly():
     own = changed(LOITER, autopilot="px4", mode="LOITER", in_hold=True, left_by_itself=True, system_status=CRITICAL)
-    state, decision = reduce(SafetyState(), own, 0.0, Command.ENGAGE, LIMITS)
+    state, decision = reduce(Idle(), own, 0.0, Command.ENGAGE, LIMITS)
     assert decision.answer.accepted
     for seen in (own, changed(own, system_status=4), changed(own, left_by_itself=False)):
         assert reduce(state, seen, 2.0, None, LIMITS)[1][:2] == (Action.HOLD, ModeRequest.NONE)
@@ -57,7 +57,7 @@ def test_no_mode_is_requested_in_a_hold_of_the_autopilot_that_another_failsafe_m
 def test_several_vehicles_forbid_a_start_and_end_no_orbit():
     seen = changed(GOOD, vehicles=frozenset({1, 42}))
     assert reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.ORBITING
-    answer = reduce(SafetyState(), seen, 1.0, Command.START, LIMITS)[1].answer
+    answer = reduce(Idle(), seen, 1.0, Command.START, LIMITS)[1].answer
     assert (answer.accepted, answer.condition.code) == (False, ConditionCode.SEVERAL_VEHICLES)
     assert "systems 1, 42" in str(answer)
 

@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from orbit_observations import GOOD, LIMITS, changed, orbiting
 
-from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig, OrbitGoal
 from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
 from drocap_ros.flight.orbit.safety import reduce
-from drocap_ros.flight.orbit.states import Command, OperatorCommand, SafetyState
-from drocap_ros.flight.orbit_goal import OrbitGoal
+from drocap_ros.flight.orbit.states import Command, Idle, OperatorCommand
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 
 CONFIG = MavlinkBridgeConfig()
@@ -108,7 +107,7 @@ def answers_of(commands):
 def test_a_second_start_names_the_command_that_changes_its_values():
     seen = changed(GOOD, mode="LOITER", in_control=False)
     allowed = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, mode_change_allowed=True))
-    requesting = reduce(SafetyState(), seen, 1.0, Command.ENGAGE, allowed)[0]
+    requesting = reduce(Idle(), seen, 1.0, Command.ENGAGE, allowed)[0]
     for state, now, word in ((orbiting(), GOOD, "adjust"), (requesting, seen, "stop")):
         answer = reduce(state, now, 1.1, Command.ENGAGE, allowed)[1].answer
         assert answer.accepted

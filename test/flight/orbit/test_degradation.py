@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, changed, orbiting
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace, slowed
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
+from drocap_ros.flight.orbit.speed import allowed_pace, next_pace, slowed
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, Pace, State
 
 RESUMING = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, resume_after_hold_s=6.0))
@@ -114,9 +114,9 @@ def test_hold_after_a_stand_keeps_the_standing_place():
     state, _ = fly(orbiting(), seen(subject_age_s=0.35), 0.2, 1.0)
     moved = seen(subject_age_s=1.1, position=GOOD.vehicle.position + 0.5)
     late, _ = reduce(state, moved, 1.2, None, LIMITS)
-    assert np.array_equal(late.hold_position, GOOD.vehicle.position)
+    assert np.array_equal(late.position, GOOD.vehicle.position)
     stopped, _ = reduce(state, moved, 1.2, Command.STOP, LIMITS)
-    assert np.array_equal(stopped.hold_position, moved.vehicle.position)
+    assert np.array_equal(stopped.position, moved.vehicle.position)
 
 
 @pytest.mark.parametrize("name", OLD)

@@ -5,11 +5,11 @@ import pytest
 from flown_copter import ALL, Flight
 from orbit_observations import GOOD, LIMITS, changed
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
-from drocap_ros.flight.orbit.last_setpoint import limit_closing
-from drocap_ros.flight.pose_history import CameraPose
+from drocap_ros.flight.autopilot.coasting import Setpoint
+from drocap_ros.flight.bridge_config import SubjectConfig
+from drocap_ros.flight.orbit.speed import limit_closing
 from drocap_ros.flight.subject.guard import Guard
-from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.flight.vehicle_filter import CameraPose
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import pinhole_matrix

@@ -8,15 +8,14 @@ import pytest
 from orbit_observations import changed
 
 from drocap_ros.flight.autopilot.autopilot import LossSettings
+from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.autopilot.px4 import PX4
-from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.bridge_config import OrbitConfig, OrbitGoal, SafetyConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed
-from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
+from drocap_ros.flight.orbit.setpoint import harmless
+from drocap_ros.flight.orbit.speed import coast_speed, slowed_condition
 from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.orbit_goal import OrbitGoal
-from drocap_ros.flight.safety_config import SafetyConfig
 
 LIMITS = Limits(SafetyConfig(), OrbitConfig())
 ZERO, CENTRE = np.zeros(3), np.zeros(2)

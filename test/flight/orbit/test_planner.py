@@ -6,9 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.bridge_config import OrbitConfig, goal_of
 from drocap_ros.flight.orbit.planner import Scene, advance, begin_orbit, least_radius, reference_position, setpoint_of
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.orbit_goal import goal_of
 
 DT = 0.05
 

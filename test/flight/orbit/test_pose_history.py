@@ -1,6 +1,6 @@
 import numpy as np
 
-from drocap_ros.flight.pose_history import PoseHistory
+from drocap_ros.flight.vehicle_filter import PoseHistory
 from drocap_ros.flight.vehicle_state import VehicleState
 
 S = 1_000_000_000

@@ -8,12 +8,23 @@ from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, changed, orbiting
 
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.autopilot.autopilot import LossSettings
+from drocap_ros.flight.bridge_config import SafetyConfig
 from drocap_ros.flight.conditions import ConditionCode, condition
 from drocap_ros.flight.orbit.motion_checks import battery_condition
-from drocap_ros.flight.orbit.safety import permit_mode, reduce
-from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
-from drocap_ros.flight.orbit.way_out import way_out
-from drocap_ros.flight.safety_config import SafetyConfig
+from drocap_ros.flight.orbit.safety import permit_mode, reduce, way_out
+from drocap_ros.flight.orbit.states import (
+    Action,
+    Command,
+    Fault,
+    Holding,
+    Idle,
+    ModeRequest,
+    Orbiting,
+    Ready,
+    Requesting,
+    State,
+    TakenOver,
+)
 
 BAD = {
     "disturbance": {"disturbance": condition(ConditionCode.CLOCK_JUMPED, jump_s=3.0)},
@@ -92,7 +103,7 @@ def bad(name, base=GOOD):
 
 @pytest.mark.parametrize("name", BAD)
 def test_start_is_refused_with_the_code_of_the_failed_condition(name):
-    state, decision = reduce(SafetyState(), bad(name), 0.0, Command.START, LIMITS)
+    state, decision = reduce(Idle(), bad(name), 0.0, Command.START, LIMITS)
     assert state.state == State.IDLE
     assert decision.action == Action.NOTHING
     assert decision.answer.accepted is False
@@ -115,11 +126,11 @@ def test_motion_ends_at_once_and_never_resumes_by_itself(name):
 def test_hold_latches_the_position_requests_the_hold_mode_and_then_sends_nothing():
     moving = changed(GOOD, velocity=np.array([0.0, 2.0, 0.0]))
     state, decision = reduce(orbiting(), changed(moving, subject=None), 1.0, None, LIMITS)
-    assert np.array_equal(state.hold_position, GOOD.vehicle.position)
+    assert np.array_equal(state.position, GOOD.vehicle.position)
     assert decision == (Action.HOLD, ModeRequest.NONE, None)
     drifted = changed(moving, position=GOOD.vehicle.position + 1.0)
     state, decision = reduce(state, drifted, 2.0, None, LIMITS)
-    assert np.array_equal(state.hold_position, GOOD.vehicle.position)
+    assert np.array_equal(state.position, GOOD.vehicle.position)
     assert decision.mode_request == ModeRequest.NONE
     at_rest = changed(drifted, velocity=np.zeros(3))
     state, decision = reduce(state, at_rest, 2.1, None, LIMITS)
@@ -154,7 +165,7 @@ def test_hold_without_a_trustworthy_state_keeps_the_last_position_and_requests_n
     lost = changed(lost, velocity=np.array([0.0, 2.0, 0.0]))
     state, decision = reduce(orbiting(), lost, 1.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.NONE, None)
-    assert np.allclose(state.hold_position, [6.0, 0.8, 2.5])  # carried on by the last velocity
+    assert np.allclose(state.position, [6.0, 0.8, 2.5])  # carried on by the last velocity
     lost = changed(lost, link_age_s=3.0)
     _, decision = reduce(state, lost, 4.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.NONE, None)
@@ -165,7 +176,7 @@ def test_hold_without_a_trustworthy_state_keeps_the_last_position_and_requests_n
     assert decision == (Action.HALT, ModeRequest.NONE, None)
     back, decision = reduce(state, GOOD, 2.5, None, LIMITS)
     assert decision.action == Action.HOLD
-    assert np.array_equal(back.hold_position, GOOD.vehicle.position)
+    assert np.array_equal(back.position, GOOD.vehicle.position)
 
 
 def test_hold_without_satellite_fix_sends_velocity_zero_then_requests_the_hold_mode():
@@ -203,26 +214,26 @@ def test_uncommanded_mode_is_a_take_over_and_nothing_is_sent(mode):
 
 
 def test_start_never_changes_the_mode_and_engage_only_when_allowed():
-    state, decision = reduce(SafetyState(), LOITER, 0.0, Command.START, LIMITS)
+    state, decision = reduce(Idle(), LOITER, 0.0, Command.START, LIMITS)
     assert refusal(decision) == ConditionCode.NOT_IN_CONTROL_MODE
     assert decision.mode_request == ModeRequest.NONE
     forbidden = LIMITS._replace(safety=SafetyConfig(commands_enabled=True))
-    state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, forbidden)
+    state, decision = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, forbidden)
     assert refusal(decision) == ConditionCode.MODE_CHANGE_FORBIDDEN
     assert decision.mode_request == ModeRequest.NONE
     lossy = changed(LOITER, packet_loss=0.4)
-    state, decision = reduce(SafetyState(), lossy, 0.0, Command.ENGAGE, LIMITS)
+    state, decision = reduce(Idle(), lossy, 0.0, Command.ENGAGE, LIMITS)
     assert refusal(decision) == ConditionCode.PACKETS_LOST
     assert "40 % of the autopilot's packets" in str(decision.answer.condition)
     assert decision.mode_request == ModeRequest.NONE
-    state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    state, decision = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)
     assert decision.mode_request == ModeRequest.CONTROL
     state, decision = reduce(permit_mode(state, "GUIDED"), GOOD, 0.3, None, LIMITS)
     assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
 
 
 def test_why_an_engage_ended_without_an_orbit_stays_until_the_next_command():
-    requesting = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)[0]
+    requesting = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)[0]
     state = reduce(requesting, bad("gps", LOITER), 1.0, None, LIMITS)[0]
     assert (state.state, state.failed.code) == (State.IDLE, ConditionCode.REQUEST_ENDED)
     assert "satellite" in str(state.failed)
@@ -233,20 +244,20 @@ def test_why_an_engage_ended_without_an_orbit_stays_until_the_next_command():
         assert (state.state, state.condition) == (State.READY, state.failed)
     assert reduce(state, LOITER, 61.0, Command.STOP, LIMITS)[0].failed is None
     again = reduce(state, LOITER, 61.0, Command.ENGAGE, LIMITS)[0]
-    assert (again.requesting, again.failed) == (True, None)
+    assert isinstance(again, Requesting)
 
 
 @pytest.mark.parametrize(
     ("state", "seen", "words"),
     [
-        (SafetyState(State.READY), GOOD, "`drocap orbit start` begins"),
-        (SafetyState(State.READY), LOITER, "`drocap orbit engage` requests control and begins an orbit, or switch to"),
-        (SafetyState(State.HOLDING), GOOD, "`drocap orbit start` begins"),
-        (SafetyState(State.HOLDING), changed(GOOD, stream_gap_s=3.0), "nothing is sent any more; `drocap orbit start`"),
-        (SafetyState(State.TAKEN_OVER), LOITER, "`drocap orbit stop` acknowledges"),
-        (SafetyState(State.FAULT), GOOD, "`drocap orbit stop` acknowledges"),
-        (SafetyState(State.ORBITING), GOOD, ""),
-        (SafetyState(State.IDLE), GOOD, ""),
+        (Ready(), GOOD, "`drocap orbit start` begins"),
+        (Ready(), LOITER, "`drocap orbit engage` requests control and begins an orbit, or switch to"),
+        (Holding(), GOOD, "`drocap orbit start` begins"),
+        (Holding(), changed(GOOD, stream_gap_s=3.0), "nothing is sent any more; `drocap orbit start`"),
+        (TakenOver(), LOITER, "`drocap orbit stop` acknowledges"),
+        (Fault(), GOOD, "`drocap orbit stop` acknowledges"),
+        (Orbiting(), GOOD, ""),
+        (Idle(), GOOD, ""),
     ],
 )
 def test_a_state_says_what_leads_out(state, seen, words):
@@ -256,9 +267,9 @@ def test_a_state_says_what_leads_out(state, seen, words):
 
 
 def test_without_the_permission_to_change_the_mode_the_pilot_or_the_configuration_leads_out():
-    assert way_out(SafetyState(State.READY), LOITER, mode_change_allowed=False).endswith("then `drocap orbit start`")
+    assert way_out(Ready(), LOITER, mode_change_allowed=False).endswith("then `drocap orbit start`")
     px4 = changed(LOITER, autopilot="px4")
-    assert "mode_change_allowed" in way_out(SafetyState(State.READY), px4, mode_change_allowed=False)
+    assert "mode_change_allowed" in way_out(Ready(), px4, mode_change_allowed=False)
 
 
 def test_where_the_speed_decides_the_words_of_a_near_subject_name_its_share():
@@ -271,7 +282,7 @@ def test_where_the_speed_decides_the_words_of_a_near_subject_name_its_share():
 
 def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():
     limits = LIMITS._replace(warm_up_s=1.2)
-    state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, limits)
+    state, decision = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, limits)
     assert decision[:2] == (Action.HOLD, ModeRequest.NONE)
     assert decision.answer.condition.code == ConditionCode.REQUESTING_CONTROL
     assert reduce(state, LOITER, 1.3, None, limits)[1].mode_request == ModeRequest.CONTROL
@@ -285,7 +296,7 @@ def test_disarming_ends_the_orbit_and_disabled_commands_are_refused():
     state, decision = reduce(orbiting(), changed(GOOD, armed=False), 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.IDLE, Action.NOTHING)
     off = LIMITS._replace(safety=SafetyConfig())
-    state, decision = reduce(SafetyState(), GOOD, 0.0, Command.START, off)
+    state, decision = reduce(Idle(), GOOD, 0.0, Command.START, off)
     assert refusal(decision) == ConditionCode.COMMANDS_DISABLED
 
 
@@ -302,12 +313,12 @@ def test_hold_position_retreats_from_an_approaching_subject():
     for step, distance in enumerate((4.0, 3.9, 3.8, 3.7)):
         state, decision = reduce(state, near(distance, velocity=np.array([1.0, 0, 0])), 10.0 + step, None, LIMITS)
         assert decision == (Action.HOLD, ModeRequest.NONE, None)
-    assert state.hold_position[0] > 3.7 + 1.0  # ahead of a vehicle that moves out, up to the fence
-    assert state.hold_position[2] == 2.5
+    assert state.position[0] > 3.7 + 1.0  # ahead of a vehicle that moves out, up to the fence
+    assert state.position[2] == 2.5
     # The subject stands: the hold position stays, and the autopilot's own hold follows.
     still = changed(near(6.5), approach_m_s=0.0)
     after, _ = reduce(state, still, 14.0, None, LIMITS)
-    assert (after.hold_position == state.hold_position).all()
+    assert (after.position == state.position).all()
     assert reduce(after, still, 15.0, None, LIMITS)[1].mode_request == ModeRequest.HOLD
 
 
@@ -320,8 +331,8 @@ def test_vehicle_that_moves_away_fast_is_held_where_it_can_stop():
         ), 10.0, None, LIMITS)[0] for away in (0.5, 1.8)
     ]  # fmt: skip
     assert [state.state for state in begun] == [State.HOLDING] * 2
-    assert begun[0].hold_position[0] == pytest.approx(8.0)
-    assert begun[1].hold_position[0] == pytest.approx(9.5)
+    assert begun[0].position[0] == pytest.approx(8.0)
+    assert begun[1].position[0] == pytest.approx(9.5)
 
 
 @pytest.mark.parametrize("north_m", np.arange(0.0, 40.0, 5.0))
@@ -336,12 +347,12 @@ def test_a_retreat_ends_at_the_fence_and_never_leads_to_the_subject(east_m, nort
         )
         state, decision = reduce(state, seen, 10.0 + 0.05 * step, None, LIMITS)
         assert decision.action == Action.HOLD
-        hold = state.hold_position
+        hold = state.position
         assert hold[0] >= east_m
         assert hold[1] == pytest.approx(north_m)
         centre_m, own_m = np.linalg.norm(hold[:2]), np.linalg.norm(here[:2])
         assert centre_m <= max(LIMITS.safety.fence_radius_m, own_m) + 1e-6
-    assert state.hold_position[0] > east_m or own_m > 39.0  # it does retreat
+    assert state.position[0] > east_m or own_m > 39.0  # it does retreat
 
 
 @pytest.mark.parametrize(("east_m", "held_m"), [(30.0, 31.5), (38.8, 40.0), (40.2, 40.2)])
@@ -352,18 +363,18 @@ def test_a_hold_on_the_way_out_ends_at_the_fence(east_m, held_m):
     )  # fmt: skip
     state, _ = reduce(orbiting(), seen, 10.0, Command.STOP, LIMITS)
     assert state.state == State.HOLDING
-    assert state.hold_position[0] == pytest.approx(held_m)
+    assert state.position[0] == pytest.approx(held_m)
 
 
 def test_a_stop_ends_the_retreat():
     state, _ = reduce(orbiting(), near(4.0), 10.0, None, LIMITS)
     state, _ = reduce(state, near(3.9), 10.1, None, LIMITS)
-    assert state.hold_position[0] > 5.0
+    assert state.position[0] > 5.0
     state, decision = reduce(state, near(3.8), 10.2, Command.STOP, LIMITS)
     assert (decision.answer.accepted, state.condition.code) == (True, ConditionCode.STOPPED)
     for step in range(20):
         state, decision = reduce(state, near(3.7), 10.3 + 0.05 * step, None, LIMITS)
-        assert (state.hold_position[0], decision.action) == (3.8, Action.HOLD)
+        assert (state.position[0], decision.action) == (3.8, Action.HOLD)
 
 
 def test_a_hold_follows_a_jump_of_the_reported_position():
@@ -372,11 +383,11 @@ def test_a_hold_follows_a_jump_of_the_reported_position():
     jumped = condition(ConditionCode.POSITION_JUMPED, jump_m=5.0)
     seen = changed(GOOD, position=np.array([11.0, 0.0, 2.5]), disturbance=jumped)
     state, decision = reduce(state, seen, 10.1, None, LIMITS)
-    assert (state.hold_position, decision.action) == (None, Action.HALT)
+    assert (state.position, decision.action) == (None, Action.HALT)
     seen = changed(seen, disturbance=None)
     for step in range(12):
         state, decision = reduce(state, seen, 10.15 + 0.05 * step, None, LIMITS)
-    assert (state.hold_position.tolist(), decision.action) == ([11.0, 0.0, 2.5], Action.HOLD)
+    assert (state.position.tolist(), decision.action) == ([11.0, 0.0, 2.5], Action.HOLD)
 
 
 @pytest.mark.parametrize(
@@ -390,10 +401,10 @@ def test_a_hold_follows_a_jump_of_the_reported_position():
 )
 def test_hold_for_another_reason_than_nearness_does_not_move(seen, command):
     state, _ = reduce(orbiting(), seen, 10.0, command, LIMITS)
-    place = state.hold_position.copy()
+    place = state.position.copy()
     state, decision = reduce(state, near(3.2), 10.2, None, LIMITS)
     assert decision.action == Action.HOLD
-    assert (state.hold_position == place).all()
+    assert (state.position == place).all()
 
 
 @pytest.mark.parametrize(
@@ -401,29 +412,29 @@ def test_hold_for_another_reason_than_nearness_does_not_move(seen, command):
 )
 def test_hold_retreats_only_from_a_located_subject(values):
     state, _ = reduce(orbiting(), near(4.0), 10.0, None, LIMITS)
-    place = state.hold_position.copy()
+    place = state.position.copy()
     state, _ = reduce(state, near(3.2, **values), 10.2, None, LIMITS)
-    assert (state.hold_position == place).all()
+    assert (state.position == place).all()
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(_SEEN), st.sampled_from([None, None, *Command])), max_size=60))
 def test_invariants_hold_in_any_history(history):
-    state, started = SafetyState(), False
+    state, started = Idle(), False
     for i, (seen, command) in enumerate(history):
         before = state
         state, decision = reduce(state, seen, 0.25 * i, command, LIMITS)
         started = command in (Command.START, Command.ENGAGE)
         if decision.action == Action.ORBIT:
             assert not any(seen is s for s in _SEEN[1:])  # only with everything good
-            assert before.state == State.ORBITING or started or not math.isnan(before.requesting_s)
+            assert before.state == State.ORBITING or started or isinstance(before, Requesting)
         if before.state == State.TAKEN_OVER and command != Command.STOP:
             assert state.state == State.TAKEN_OVER
             assert decision[:2] == (Action.NOTHING, ModeRequest.NONE)
         if state.state in (State.IDLE, State.TAKEN_OVER):
             assert decision[:2] == (Action.NOTHING, ModeRequest.NONE)
         if decision.mode_request == ModeRequest.CONTROL:
-            assert not math.isnan(state.requesting_s)
+            assert isinstance(state, Requesting)
         if decision.mode_request != ModeRequest.NONE:
             wanted = "GUIDED" if decision.mode_request == ModeRequest.CONTROL else "BRAKE"
             state = permit_mode(state, wanted)
@@ -462,7 +473,7 @@ def test_hold_mode_is_requested_at_once_when_setpoints_are_not_followed():
 def test_too_long_a_timeout_of_the_autopilot_forbids_motion():
     seen = changed(GOOD, loss_settings=LossSettings("GUID_TIMEOUT", 3.0, "", math.nan))
     limits = LIMITS._replace(max_control_timeout_s=0.5)
-    _, decision = reduce(SafetyState(), seen, 0.0, Command.START, limits)
+    _, decision = reduce(Idle(), seen, 0.0, Command.START, limits)
     assert refusal(decision) == ConditionCode.TIMEOUT_TOO_LONG
     assert reduce(orbiting(), seen, 1.0, None, limits)[0].state == State.HOLDING
     assert reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.ORBITING

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from orbit_observations import GOOD, changed
 
-from drocap_ros.flight.autopilot.setpoint import Setpoint
-from drocap_ros.flight.orbit.last_setpoint import Shortfall
+from drocap_ros.flight.autopilot.coasting import Setpoint
+from drocap_ros.flight.orbit.setpoint import Shortfall
 
 HERE, SUBJECT = np.array([6.0, 0.0, 2.5]), np.zeros(3)
 ASKED = Setpoint(HERE, np.array([-1.4, 0.5, 0.0]), np.zeros(3), np.pi, 0.0)

@@ -5,7 +5,7 @@ import pytest
 from orbit_observations import GOOD, LIMITS, LOITER, changed, orbiting
 
 from drocap_ros.flight.orbit.safety import reduce
-from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
+from drocap_ros.flight.orbit.states import Action, Command, Idle, ModeRequest, State
 
 
 def lost(link_age_s, **values):
@@ -41,7 +41,7 @@ def test_the_mode_after_a_loss_is_known_by_a_heartbeat_since_the_loss(silent_s):
         state, decision = reduce(state, early if i == 0 else changed(early, heartbeat_age_s=0.05), t, None, LIMITS)
         assert decision.mode_request == ModeRequest.NONE or i * 0.05 >= 1.3
     assert decision == (Action.HOLD, ModeRequest.HOLD, None)
-    assert np.array_equal(state.hold_position, early.vehicle.position)
+    assert np.array_equal(state.position, early.vehicle.position)
 
 
 def test_a_mode_of_somebody_else_is_a_take_over_however_late_it_is_heard():
@@ -57,7 +57,7 @@ def test_a_mode_is_requested_only_right_after_a_heartbeat_and_with_a_short_round
     assert reduce(state, old, 11.1, None, LIMITS)[1] == (Action.HOLD, ModeRequest.NONE, None)
     slow = changed(GOOD, round_trip_s=0.6)
     assert reduce(state, slow, 11.1, None, LIMITS)[1] == (Action.HOLD, ModeRequest.NONE, None)
-    engaging, _ = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    engaging, _ = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)
     unseen = changed(LOITER, heartbeat_age_s=0.15)
     assert reduce(engaging, unseen, 0.2, None, LIMITS)[1].mode_request == ModeRequest.NONE
 
@@ -69,7 +69,7 @@ def test_no_mode_is_requested_while_many_packets_are_lost_and_the_hold_waits_for
         state, decision = reduce(state, lossy, 10.0 + 0.05 * i, None, LIMITS)
         assert (state.state, decision[:2]) == (State.HOLDING, (Action.HOLD, ModeRequest.NONE))
     assert reduce(state, GOOD, 20.0, None, LIMITS)[1].mode_request == ModeRequest.HOLD
-    engaging, _ = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    engaging, _ = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)
     unseen = changed(LOITER, packet_loss=0.5)
     assert reduce(engaging, unseen, 0.2, None, LIMITS)[1].mode_request == ModeRequest.NONE
 

@@ -4,17 +4,14 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import ParameterError
-from drocap_ros.flight.frames import OPTICAL_FROM_FLU
-from drocap_ros.flight.pose_history import CameraPose, PoseHistory
+from drocap_ros.flight.bridge_config import SubjectConfig
 from drocap_ros.flight.subject.subject_filter import SubjectFilter
 from drocap_ros.flight.subject.subject_measurement import locate_subject
-from drocap_ros.flight.subject_config import SubjectConfig
-from drocap_ros.flight.vehicle_filter import VehicleFilter
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle_filter import CameraPose, PoseHistory, VehicleFilter
+from drocap_ros.flight.vehicle_state import OPTICAL_FROM_FLU, VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.skeleton import BODY_15
 
 S = 1_000_000_000

@@ -10,7 +10,7 @@ from orbit_observations import GOOD, LIMITS, changed, orbiting
 from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
-from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
+from drocap_ros.flight.orbit.states import Action, Command, Idle, ModeRequest, State
 
 PX4 = changed(GOOD, autopilot="px4", mode="OFFBOARD", heard=frozenset({"OFFBOARD"}))
 HOLD = changed(PX4, mode="LOITER", heard=frozenset({"LOITER"}), in_control=False, in_hold=True)
@@ -19,7 +19,7 @@ WARM = LIMITS._replace(warm_up_s=1.2)
 
 
 def engaged(seen):
-    state, _ = reduce(SafetyState(), seen, 0.0, None, WARM)
+    state, _ = reduce(Idle(), seen, 0.0, None, WARM)
     state, decision = reduce(state, seen, 0.1, Command.ENGAGE, WARM)
     assert decision.answer.accepted
     return state

@@ -11,8 +11,7 @@ from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.preflight.checks import all_findings, is_ready
-from drocap_ros.flight.preflight.measure import Listening, version_text
+from drocap_ros.flight.preflight.measure import Listening, all_findings, is_ready, version_text
 from drocap_ros.flight.preflight.setup_checks import Setup
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter

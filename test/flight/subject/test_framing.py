@@ -9,14 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
 from drocap_ros.flight.autopilot.px4 import PX4
-from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig, goal_of
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.states import Command, State
-from drocap_ros.flight.orbit_goal import goal_of
 from drocap_ros.flight.subject.framing import Framing, View, framing_margin, nearest_framed
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle_state import VehicleState, camera_rotation
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.vehicle.mount import tilted_camera
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config

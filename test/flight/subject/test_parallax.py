@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drocap_ros.flight.subject.parallax import Parallax
+from drocap_ros.flight.subject.guard import Parallax
 
 _STEP_S, _RADIUS_M = 0.1, 6.0
 

@@ -8,8 +8,8 @@ from branched import branched
 from orbit_observations import GOOD, LIMITS, changed
 
 from drocap_ros.flight.conditions import PICTURE_CODES, ConditionCode
-from drocap_ros.flight.orbit.degradation import allowed_pace
 from drocap_ros.flight.orbit.motion_checks import subject_condition
+from drocap_ros.flight.orbit.speed import allowed_pace
 from drocap_ros.flight.orbit.states import State
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 

@@ -5,14 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from drocap_ros.flight.bridge_config import OrbitConfig, SubjectConfig
 from drocap_ros.flight.orbit.planner import least_radius
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.pose_history import CameraPose
 from drocap_ros.flight.subject.subject_filter import SubjectFilter
-from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.flight.vehicle_filter import CameraPose
 from drocap_ros.observation import PoseObservation
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 S = 1_000_000_000

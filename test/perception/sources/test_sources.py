@@ -47,18 +47,6 @@ def test_stamps_are_the_presentation_times(tmp_path):
     assert frames[3].image.shape == (48, 64, 3)
 
 
-@pytest.mark.parametrize("older", [True, False])
-def test_video_opens_with_each_way_of_opencv_to_be_silent(tmp_path, monkeypatch, older):
-    """To OpenCV 4.6 there is ``cv2.setLogLevel``, later ``cv2.utils.logging``, and perhaps neither one day."""
-    path, levels = write_video(tmp_path / "a.mp4"), []
-    monkeypatch.delattr(cv2.utils, "logging", raising=False)
-    if older:
-        monkeypatch.setattr(cv2, "setLogLevel", levels.append, raising=False)
-    with open_source(path) as source:
-        assert len(list(source)) == 12
-    assert levels == [0] * older
-
-
 def test_nominal_rate_does_not_replace_the_times(tmp_path):
     """Half the media's time scale doubles the times and leaves the nominal rate."""
     path = write_video(tmp_path / "a.mp4")

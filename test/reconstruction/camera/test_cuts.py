@@ -10,7 +10,7 @@ from fixed_points import MATRIX, SIZE, Scene, looking, orbit, points_of, seen
 from walking import make_walk
 
 from drocap_ros.background import Background
-from drocap_ros.reconstruction.camera.cuts import cut_times, cuts
+from drocap_ros.reconstruction.camera.kinds import cut_times, cuts
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
 from drocap_ros.skeleton import BODY_15

@@ -11,7 +11,7 @@ from fixed_points import MATRIX, SIZE, Scene, looking, orbit, points_of, seen, s
 from drocap_ros.camera_path import Kind, PictureFacts
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.from_picture import camera_from_points
-from drocap_ros.reconstruction.common.threads import blas_threads
+from drocap_ros.reconstruction.common.engine import blas_threads
 
 FPS = 12.0
 FRAMES = 72

@@ -10,8 +10,7 @@ from fixed_points import MATRIX, Scene, looking, orbit, points_of, seen, shape_e
 
 from drocap_ros.camera_path import CameraErrors
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction.camera.path_adjustment import adjust_path, initial_state
-from drocap_ros.reconstruction.camera.path_equations import PathEquations
+from drocap_ros.reconstruction.camera.path_adjustment import adjust_path, initial_state, posterior_of, with_own_noise
 from drocap_ros.reconstruction.camera.path_model import (
     ATTITUDE_LATENCY,
     KNOT,
@@ -20,10 +19,9 @@ from drocap_ros.reconstruction.camera.path_model import (
     SHARED,
     PathConfig,
     PathInput,
+    views_of,
 )
-from drocap_ros.reconstruction.camera.path_posterior import posterior_of, with_own_noise
-from drocap_ros.reconstruction.camera.path_residuals import PathResiduals, gradient, weights_of
-from drocap_ros.reconstruction.camera.views import views_of
+from drocap_ros.reconstruction.camera.path_residuals import PathEquations, PathResiduals, gradient, weights_of
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 
 FPS = 12.0

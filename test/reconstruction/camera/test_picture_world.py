@@ -15,7 +15,7 @@ from drocap_ros.camera_path import CameraPath, Kind, PictureFacts, UpSource
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.camera.upright import set_upright
-from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.reconstruction.reconstruct import reconstruct, solve
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
@@ -96,7 +96,7 @@ def test_camera_that_stands_still_gives_a_world_at_its_place() -> None:
 
 def test_cut_within_one_camera_leaves_the_motion_in_camera_axes_and_is_named() -> None:
     given = tracks(*orbit(FRAMES, FPS), cut=True)
-    motion = reconstruct(given)
+    motion = solve(given).motion
     assert motion.frame == "camera"
     assert motion.meta["camera"]["kind"] == "cut"
     assert "cut" in telemetry_words(motion.meta)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg.lapack import dtbtrs
 
-from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
+from drocap_ros.reconstruction.common.engine import backward, band_factor, forward
 
 
 @pytest.mark.parametrize(("size", "width"), [(5, 9), (1200, 115), (1203, 115), (2500, 115), (3700, 7), (2600, 1300)])

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.reconstruction.common.evidence import Evidence
+from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.evidence import body_places, with_evidence
 from drocap_ros.skeleton import BODY_17

@@ -6,7 +6,7 @@ import numpy as np
 
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction.common.spread import Spread, packed
+from drocap_ros.reconstruction.common.poses import Spread, packed
 
 
 def test_poses_of_other_size_and_lean_have_the_covariance_that_is_told():

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("threadpoolctl")
 
 CODE = """
-from drocap_ros.reconstruction.common.threads import blas_threads
+from drocap_ros.reconstruction.common.engine import blas_threads
 with blas_threads(1):
     import scipy.linalg
     import threadpoolctl

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drocap_ros.reconstruction.lifted.depth_signs import depth_signs
+from drocap_ros.reconstruction.lifted.window_solver import depth_signs
 
 
 def test_signs_change_where_a_bone_crosses_the_image_plane_despite_outliers():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.lifted.even_frames import even_slots, spread_keypoints
+from drocap_ros.reconstruction.common.windows import even_slots, spread_keypoints
 
 
 def test_dropped_frames_leave_empty_slots():

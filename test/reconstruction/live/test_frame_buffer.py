@@ -10,8 +10,7 @@ from live_stream import observed
 from walking import stamps
 
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin
-from drocap_ros.reconstruction.live.stream_order import StreamEvent
+from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin, StreamEvent
 
 ADJUSTER = BundleAdjusterConfig(period_s=0.5, window_s=2.0)
 JOINTS = np.zeros((15, 3))

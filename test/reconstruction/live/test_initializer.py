@@ -14,8 +14,8 @@ from drocap_ros.evaluation.metrics import is_mirrored, pa_mpjpe
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import InitializerConfig
+from drocap_ros.reconstruction.live.frame_buffer import StreamEvent
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
-from drocap_ros.reconstruction.live.stream_order import StreamEvent
 
 FRAMES = 72
 S = 10**9
@@ -111,7 +111,7 @@ def test_wrong_arrays_are_refused(name: str, values: np.ndarray, words: str) -> 
 
 
 def test_memory_is_bounded_at_any_frame_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drocap_ros.reconstruction.live.stream_lifter.MAX_IMAGES", 40)
+    monkeypatch.setattr("drocap_ros.reconstruction.live.initializer.MAX_IMAGES", 40)
     initializer = LiveInitializer(InitializerConfig(past_s=10.0))
     # 1000 images per second: the age bounds nothing, the counts do.
     for i, o in enumerate(observed(60) * 2):

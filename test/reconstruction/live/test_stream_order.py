@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drocap_ros.reconstruction.live.stream_order import LATE_RUN, StreamEvent, StreamOrder
+from drocap_ros.reconstruction.live.frame_buffer import LATE_RUN, StreamEvent, StreamOrder
 
 S = 10**9
 Y1970, NOW, Y2100 = 0, 1_790_000_000 * S, 4_102_444_800 * S

@@ -21,11 +21,10 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.camera.fusion import Fusion, fuse_telemetry
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.live.frame_buffer import StreamEvent
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
-from drocap_ros.reconstruction.live.latest_place import LatestPlace
-from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
+from drocap_ros.reconstruction.live.latest_pose import LatestPlace, LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
-from drocap_ros.reconstruction.live.stream_order import StreamEvent
 from drocap_ros.reconstruction.live.window import TelemetryUse
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.tracks import Tracks
@@ -267,7 +266,7 @@ def test_reports_of_another_flight_are_refused_by_the_points_and_seldom_asked_ag
         asked.append(int(camera.stamp_ns[-1]))
         return fuse_telemetry(camera, *rest)
 
-    monkeypatch.setattr("drocap_ros.reconstruction.live.fused_camera.fuse_telemetry", counted)
+    monkeypatch.setattr("drocap_ros.reconstruction.live.world_windows.fuse_telemetry", counted)
     other = replace(true, rotation=true.rotation[::-1], position=true.position[::-1])
     # The same vehicle films the second subject: the pause goes on.
     half = len(true.observations) // 2

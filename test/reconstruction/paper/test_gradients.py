@@ -9,12 +9,11 @@ import pytest
 
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.paper.articulation import articulation_term, articulation_value
-from drocap_ros.reconstruction.paper.bundle_adjustment import Objective
+from drocap_ros.reconstruction.paper.bundle_adjustment import Objective, articulation_term, articulation_value
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
 from drocap_ros.reconstruction.paper.reprojection import Projection, information_from, noise_std
 from drocap_ros.reconstruction.paper.rotations import update_rotations
-from drocap_ros.reconstruction.paper.sparse_fit import sparse_gradient
+from drocap_ros.reconstruction.paper.viewpoint_search import sparse_gradient
 
 F = 7
 

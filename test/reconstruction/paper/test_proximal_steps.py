@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from drocap_ros.reconstruction.paper.bundle_adjustment import nuclear_norm, singular_value_threshold
 from drocap_ros.reconstruction.paper.dictionary import soft_threshold
-from drocap_ros.reconstruction.paper.nuclear_norm import nuclear_norm, singular_value_threshold
 
 Step = Callable[[np.ndarray, float], np.ndarray]
 

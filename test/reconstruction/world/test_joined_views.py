@@ -9,10 +9,9 @@ import pytest
 from test_world_adjustment import FPS, exact_input, orbit, walker
 
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
-from drocap_ros.reconstruction.world.joined_views import JoinedViews, joined_state, joined_weights, view_state
 from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world
 from drocap_ros.reconstruction.world.world_model import CAMERA, GLOBALS, LENGTHS, SCALE, WorldInput, WorldState
-from drocap_ros.reconstruction.world.world_residuals import Contacts
+from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, weights_of
 
 
 def two_views(joints: np.ndarray) -> WorldInput:
@@ -31,14 +30,14 @@ def test_derivatives_of_all_views_are_those_of_the_cost() -> None:
     data = two_views(joints)
     shared = np.zeros(GLOBALS)
     shared[LENGTHS], shared[SCALE] = 1.01 * data.lengths, 1.03
-    state = joined_state(WorldState(joints + rng.normal(0, 0.03, joints.shape), np.zeros((7, CAMERA)), shared), 1)
+    state = WorldState(joints + rng.normal(0, 0.03, joints.shape), np.zeros((7, CAMERA)), shared).with_views(1)
     state = replace(
         state,
         camera=state.camera + rng.normal(0, 0.01, state.camera.shape),
         globals=np.append(state.globals[:GLOBALS], rng.normal(0, 0.02, len(state.globals) - GLOBALS)),
     )
-    weights, contact = joined_weights(data), rng.random((6, 4))
-    here = JoinedViews(data, weights, state, Contacts(contact, 0.2))
+    weights, contact = weights_of(data), rng.random((6, 4))
+    here = WorldResiduals(data, weights, state, Contacts(contact, 0.2))
     by_frame, by_shared = here.gradient()
     step = 1e-6
 
@@ -63,9 +62,9 @@ def test_a_step_of_the_matrix_is_the_change_of_the_gradient() -> None:
     data = two_views(joints)
     shared = np.zeros(GLOBALS)
     shared[LENGTHS], shared[SCALE] = data.lengths, 1.0
-    state = joined_state(WorldState(joints, np.zeros((20, CAMERA)), shared), 1)
-    here = JoinedViews(data, joined_weights(data), state, Contacts(np.zeros((19, 4)), 0.0))
-    band, border, corner = here.normal_matrix()
+    state = WorldState(joints, np.zeros((20, CAMERA)), shared).with_views(1)
+    here = WorldResiduals(data, weights_of(data), state, Contacts(np.zeros((19, 4)), 0.0))
+    band, border, corner = here.equations()
     size = len(band)
     full = np.zeros((size, size))
     for offset in range(band.shape[1]):
@@ -95,5 +94,5 @@ def test_exact_images_of_two_cameras_give_body_and_place_of_the_second() -> None
     start = joints + np.random.default_rng(1).normal(0.0, 0.05, joints.shape)
     found = adjust_in_world(data, WorldState(start, np.zeros((120, CAMERA)), shared))
     assert np.linalg.norm(found.joints - joints, axis=-1).mean() < 0.02
-    moved = view_state(found.state, 1).camera[:, :3]
+    moved = found.state.of_view(1).camera[:, :3]
     np.testing.assert_allclose(moved, np.broadcast_to([-0.2, 0.2, -0.1], moved.shape), atol=0.05)

@@ -11,10 +11,8 @@ from walking import stamps
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.world.metric_scale import estimate_scale
-from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world, smooth_over_time
-from drocap_ros.simulation.capture import SimulatedCapture, simulate_capture
-from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.reconstruction.world.placement import estimate_scale, metres_per_px, place_in_world, smooth_over_time
+from drocap_ros.simulation.capture import SimulatedCapture, SimulationConfig, simulate_capture
 from drocap_ros.simulation.orbit_camera import orbit_camera
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15

@@ -19,15 +19,12 @@ from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.world import refine
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
-from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
-from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world
-from drocap_ros.reconstruction.world.world_equations import normal_matrix
+from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world, posterior
 from drocap_ros.reconstruction.world.world_model import (
     ATTITUDE_LATENCY,
     CAMERA,
     FLOOR,
-    FRAME,
     GLOBALS,
     LENGTHS,
     MISALIGNMENT,
@@ -37,11 +34,12 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldInput,
     WorldState,
 )
-from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, gradient, weights_of
+from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, weights_of
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
+FRAME = CAMERA + 3 * len(BODY_17)
 FPS = 24.0
 MATRIX = np.array([[900.0, 0, 640.0], [0, 900.0, 360.0], [0, 0, 1.0]])
 
@@ -115,18 +113,18 @@ def test_normal_matrix_holds_body_and_camera_together_by_the_first_frame_of_the_
     shared[LENGTHS], shared[SCALE] = data.lengths, 1.0
     weights, state = weights_of(data), WorldState(joints, np.zeros((frames, CAMERA)), shared)
     here = WorldResiduals(data, weights, state, Contacts(np.ones((frames - 1, 4)), 0.2))
-    band, _, _ = normal_matrix(here)
+    band, _, _ = here.equations()
     for axis in (0, 1):
         along = np.zeros((frames, FRAME))
         along[:, [axis, *range(CAMERA + axis, FRAME, 3)]] = 1.0
         further = np.append(along.ravel(), np.zeros(band.shape[1]))
         pulls = [band[:, d] @ (along.ravel() * further[d : d + len(band)]) for d in range(band.shape[1])]
-        assert pulls[0] + 2.0 * sum(pulls[1:]) == pytest.approx(weights.first[axis], rel=1e-3)
+        assert pulls[0] + 2.0 * sum(pulls[1:]) == pytest.approx(weights.views[0].first[axis], rel=1e-3)
 
 
 def test_derivatives_are_those_of_the_cost() -> None:
     here, data, state, contact = random_point()
-    by_frame, by_shared = gradient(here)
+    by_frame, by_shared = here.gradient()
     rng, step = np.random.default_rng(1), 1e-6
 
     def cost(frames: np.ndarray, shared: np.ndarray) -> float:
@@ -146,7 +144,7 @@ def test_derivatives_are_those_of_the_cost() -> None:
 def test_normal_matrix_is_the_curvature_of_the_quadratic_terms() -> None:
     """Along a step of the quadratic terms the gradient changes by the matrix times the step."""
     here, data, state, contact = random_point()
-    band, border, corner = normal_matrix(here)
+    band, border, corner = here.equations()
     size = band.shape[0]
     full = np.zeros((size, size))
     for offset in range(band.shape[1]):
@@ -159,7 +157,7 @@ def test_normal_matrix_is_the_curvature_of_the_quadratic_terms() -> None:
     camera = np.zeros((7, FRAME))
     camera[:, 2] = rng.normal(size=7)  # the position's error
     moved = WorldResiduals(replace(data, weight=0 * data.weight), here.weights, state, Contacts(contact, 0.2))
-    flat, _, _ = normal_matrix(moved)
+    flat, _, _ = moved.equations()
     matrix = np.zeros((size, size))
     for offset in range(flat.shape[1]):
         at = np.arange(size - offset)
@@ -170,14 +168,14 @@ def test_normal_matrix_is_the_curvature_of_the_quadratic_terms() -> None:
         state.moved(camera, np.zeros(GLOBALS)),
         Contacts(contact, 0.2),
     )
-    change = gradient(there)[0] - gradient(moved)[0]
+    change = there.gradient()[0] - moved.gradient()[0]
     np.testing.assert_allclose(change.reshape(-1), matrix @ camera.reshape(-1), rtol=1e-8, atol=1e-6)
 
 
 def test_covariances_are_those_of_the_whole_inverse() -> None:
     """Selected inversion gives the blocks of the dense inverse; joints in the world depend on the scale too."""
     here, _, state, _ = random_point()
-    matrix = normal_matrix(here)
+    matrix = here.equations()
     band, border, corner = matrix
     size = len(band)
     full = np.zeros((size, size))

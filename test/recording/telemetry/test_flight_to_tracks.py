@@ -14,8 +14,7 @@ from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.vehicle.flight_path import SampledPath
-from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
+from drocap_ros.simulation.vehicle.mavlink_vehicle import SampledPath, SimulatedVehicle
 
 HOVER_S = 2.0
 

@@ -6,7 +6,8 @@ import pytest
 from telemetry_logs import heading_at, turning_log, turning_video
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.telemetry.time_offset import OffsetSource, creation_time_ns, find_offset, image_motion
+from drocap_ros.recording.telemetry.time_offset import OffsetSource, find_offset, image_motion
+from drocap_ros.recording.telemetry.video_tracks import stated_times
 
 
 def test_offset_is_estimated_from_the_cameras_turning(tmp_path):
@@ -34,10 +35,10 @@ def test_creation_time_gives_the_offset_of_an_even_orbit(tmp_path):
     place = data.index(b"mvhd") + 4
     struct.pack_into(">I", data, place + 4, 2_082_844_800 + 1_700_000_012)
     video.write_bytes(data)
-    assert creation_time_ns(video) == 1_700_000_012 * 10**9
+    assert stated_times(video)[0] == 1_700_000_012 * 10**9
     offset = find_offset(video, turning_log(40, even=True), None)
     assert offset.seconds == pytest.approx(12.0)
     assert offset.source is OffsetSource.CREATION_TIME
     for junk in (b"", data[:100], bytes(5000), b"\0\0\0\0moov" * 100):
         (tmp_path / "junk.mp4").write_bytes(junk)
-        assert creation_time_ns(tmp_path / "junk.mp4") is None
+        assert stated_times(tmp_path / "junk.mp4") == (None, None)

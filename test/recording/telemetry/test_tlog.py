@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import quaternion_from_euler, yaw_of
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
+from drocap_ros.flight.vehicle_state import quaternion_from_euler, yaw_of
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.tlog import tlog_messages
 

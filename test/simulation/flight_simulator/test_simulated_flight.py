@@ -6,14 +6,18 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.compare import compare, load_truth
 from drocap_ros.motion import load_motion
-from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import (
     FlightTruth,
     load_flight_truth,
     orbit_quality,
     save_flight_truth,
 )
-from drocap_ros.simulation.flight_simulator.world import BEGINS_AFTER_S, ActingPerson, FlightWorld
+from drocap_ros.simulation.flight_simulator.world import (
+    BEGINS_AFTER_S,
+    ActingPerson,
+    FlightSimulatorConfig,
+    FlightWorld,
+)
 from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport

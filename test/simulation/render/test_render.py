@@ -7,8 +7,7 @@ import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.simulation.orbit_camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
-from drocap_ros.simulation.render.body import body, dress
-from drocap_ros.simulation.render.quadrics import cones, ellipsoids, joined, rasterize
+from drocap_ros.simulation.render.body import body, cones, dress, ellipsoids, joined, rasterize
 from drocap_ros.simulation.render.renderer import Renderer, draw
 from drocap_ros.simulation.render.scenery import make_scenery
 from drocap_ros.simulation.simulated_person import ACTIONS, simulate_person

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from drocap_ros.flight.autopilot.px4 import PX4
-from drocap_ros.simulation.vehicle.autopilot_control import control_of
-from drocap_ros.simulation.vehicle.dynamics import Body
-from drocap_ros.simulation.vehicle.estimate_error import EstimateError
-from drocap_ros.simulation.vehicle.flight_control import Manner, Target
+from drocap_ros.simulation.vehicle.dynamics import Body, EstimateError
+from drocap_ros.simulation.vehicle.flight_control import Manner, Target, control_of
 from lab.flights.replay import Case, load_recorded, replay
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
-from drocap_ros.simulation.vehicle.autopilot_control import control_of
 from drocap_ros.simulation.vehicle.dynamics import Body
-from drocap_ros.simulation.vehicle.flight_control import Manner, Target
+from drocap_ros.simulation.vehicle.flight_control import Manner, Target, control_of
 from lab.flights.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
 
 #: Flights whose every input is recorded: nothing but ArduPilot's control moves the vehicle.

@@ -5,8 +5,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
-from drocap_ros.simulation.vehicle.flight_path import orbit_path
-from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
+from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle, orbit_path
 
 ARRIVES_S = 1.3
 QUESTION = mavlink.MAVLink(None, srcSystem=255).timesync_encode(0, 7)

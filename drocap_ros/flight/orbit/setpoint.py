@@ -1,9 +1,9 @@
-"""A setpoint may be the last one: what is added to it and taken from it, so that it is harmless if nothing follows.
+"""The setpoint of a step, in three functions: planned, limited, sent.
 
-After the death of the bridge the autopilot flies the last setpoint until its time-out, and then stops by itself; how it
-does (time-out, deceleration, gain) is a matter of its object.  One pass in three steps: :class:`Shortfall` adds what a
-vehicle behind a walking subject lacks, :func:`limit_closing` bounds the speed towards the subject by the size of his
-image, and :func:`harmless` takes away what would break a limit.
+:meth:`FlownOrbit.planned` is the setpoint of the reference; :meth:`FlownOrbit.limited` slows it down (``speed.py``),
+and adds what a vehicle behind a walking subject lacks; :func:`harmless` takes away what would break a limit if nothing
+followed.  After the death of the bridge the autopilot flies the last setpoint until its time-out, and then stops by
+itself; how it does (time-out, deceleration, gain) is a matter of its object.
 """
 
 from __future__ import annotations
@@ -13,17 +13,35 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.autopilot import greatest_speed
-from drocap_ros.flight.autopilot.coasting import Coast
-from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
+from drocap_ros.flight.autopilot.coasting import Coast, Setpoint, hold_setpoint
+from drocap_ros.flight.bridge_config import HEIGHT_ROOM_M, WORTH_TELLING, MavlinkBridgeConfig, OrbitGoal, goal_of
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.observed import Observed, SizeSight
-from drocap_ros.flight.orbit.motion_checks import OWN_SPEED_SD_M_S, REACTION_S
-from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.orbit_goal import WORTH_TELLING, OrbitGoal
-from drocap_ros.flight.subject.guard import farness
+from drocap_ros.flight.observed import Observed
+from drocap_ros.flight.orbit.command_checks import Order
+from drocap_ros.flight.orbit.motion_checks import OWN_SPEED_SD_M_S
+from drocap_ros.flight.orbit.planner import (
+    OrbitState,
+    Scene,
+    advance,
+    begin_orbit,
+    least_radius,
+    reference_position,
+    setpoint_of,
+)
+from drocap_ros.flight.orbit.speed import coast_speed, limit_closing, slowed, slowed_condition, timeout_s
+from drocap_ros.flight.orbit.states import Limits, Orbiting, Pace
+from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
+_CLEAR = (
+    "clear of min_distance_m, {:g} m, if the range is wrong; size_error, {:g}, may be 0.04 where body_height_m is the"
+    " subject's"
+)
+_FRAMED = (
+    "there the fixed camera keeps one in the picture who walks up to the vehicle; a wider lens or a gimbal keeps him"
+    " nearer"
+)
+_SURE_SIZES = 3.0  # of size_error, beyond which the picture contradicts the height
 #: m; no coast, the creep after its stop included, brings the vehicle by more nearer to the subject: 1 m is required of
 #: the bridge's death (benchmarks/flight_kills.py), and the prediction errs.
 _NEARER_M = 0.9
@@ -39,31 +57,117 @@ _TRIES = [(level, level) for level in _LEVELS]
 _TRIES_ACROSS_FIRST = [(2.0, across) for across in (2.0, 1.75, 1.5, 1.25, 1.0, 0.8, 0.6, 0.4)]
 _TRIES_ACROSS_FIRST += [(level, min(level, 0.4)) for level in _LEVELS[1:]]
 _HALVINGS = 3  # between two levels, where setpoints are held: a vehicle that lacks more retreats no more slowly
+_RATE_PER_S2 = 0.8  # of the missing velocity
+_FORGETTING_PER_S = 0.1  # of what was missing: gusts pass
+_MOST_M_S2 = 0.6  # that is added behind one who walks, 1 m/s faster than one seems to who stands: he needs none
 
 
-def coast_speed(seen: Observed, limits: Limits) -> float:
-    """Speed in m/s of a steady flight whose coast leaves room to ``max_coast_m``."""
-    autopilot = seen.autopilot
-    return greatest_speed(autopilot, _timeout_s(seen), autopilot.coast.steady * limits.safety.max_coast_m)
+class FlownOrbit:
+    """The orbit and its setpoints.
+
+    goal : of the last accepted command
+    unsafe : why the last setpoint was not sent; None = it was
+    """
+
+    def __init__(self, config: MavlinkBridgeConfig, limits: Limits) -> None:
+        self._config, self._limits = config, limits
+        self.goal: OrbitGoal = goal_of(config)
+        self.unsafe: Condition | None = None
+        self._reference: OrbitState | None = None
+        self._shortfall = Shortfall()
+        self._framed_radius_m = 0.0
+
+    @property
+    def place(self) -> np.ndarray | None:
+        """(3,) m ENU, place of the vehicle on the orbit; None = no orbit is flown."""
+        return None if self._reference is None else reference_position(self._reference)
+
+    def take(self, order: Order) -> None:
+        """Take an accepted order's goal."""
+        if order.goal is not None:
+            self.goal = order.goal
+
+    def begin(self, seen: Observed) -> None:
+        """Begin an orbit where the vehicle is."""
+        assert seen.subject.position is not None
+        vehicle = seen.vehicle
+        self._shortfall = Shortfall()
+        self._reference = begin_orbit(vehicle.position, seen.subject.position, self._config)
+
+    def end(self) -> None:
+        """No orbit is flown."""
+        self._reference = self.unsafe = None
+
+    def setpoint(self, seen: Observed, safety: Orbiting, framing: Framing, dt: float) -> Setpoint | None:
+        """The setpoint of this step, ``dt`` s after the last one; None where no orbit is flown."""
+        if self._reference is None or seen.subject.position is None:
+            return None
+        planned = self.planned(self._reference, seen, framing, dt * safety.pace.value)
+        sent, self.unsafe = harmless(self.limited(planned, seen, safety.pace), seen, safety.fence_centre, self._limits)
+        self._shortfall.learn(sent, seen, dt)
+        return sent
+
+    def planned(self, reference: OrbitState, seen: Observed, framing: Framing, dt: float) -> Setpoint:
+        """The setpoint of the reference ``dt`` s of its time later."""
+        scene = self._scene(seen, framing)
+        self._reference = advance(reference, self.goal, scene, dt, self._config)
+        return setpoint_of(self._reference, scene, self._config)
+
+    def limited(self, planned: Setpoint, seen: Observed, pace: Pace) -> Setpoint:
+        """The setpoint at this pace, with what a vehicle behind a walker lacks, bounded towards the subject."""
+        assert self._reference is not None
+        pushed = self._shortfall.added(planned, seen, self._reference.centre_velocity)
+        return limit_closing(slowed(pushed, pace, self._config.max_acceleration_m_s2), seen, self._limits)
+
+    def flown_condition(self, present: Condition, seen: Observed) -> Condition:
+        """The condition of the machine, with the radius and the speed that are flown where these are not the goal's."""
+        if self._reference is None:
+            return present
+        widened, goal = _widened_condition(present, self.goal, self._reference, self._framed_radius_m, self._config)
+        return slowed_condition(widened, goal, seen, self._limits)
+
+    def _scene(self, seen: Observed, framing: Framing) -> Scene:
+        subject, config = seen.subject, self._config
+        assert subject.position is not None
+        speed = float(np.hypot(*subject.velocity[:2]))
+        least = least_radius(
+            config, subject.sd_m, speed, config.braking_m_s2, config.size_error, subject.nearer * subject.distance_m
+        )
+        self._framed_radius_m = framing.least_radius(self.goal, speed, seen.autopilot.gives_way_s)
+        return Scene(
+            vehicle=seen.vehicle.position,
+            subject=subject.position,
+            subject_velocity=subject.velocity,
+            ground_m=config.ground_height_m + self._risen_m(seen),
+            least_radius_m=max(least, self._framed_radius_m),
+            greatest_speed_m_s=coast_speed(seen, self._limits),
+        )
+
+    def _risen_m(self, seen: Observed) -> float:
+        """By how much (m) the subject's ground is surely higher below the vehicle than assumed: one never flies lower.
+
+        The range by the ground is too long in proportion where the reported height is too great, or the ground rises.
+        """
+        config, height_m = self._config, seen.vehicle.height_m
+        lower = (1.0 - _SURE_SIZES * config.size_error - seen.subject.size_over_ground) * height_m
+        room_m = config.max_height_m - HEIGHT_ROOM_M[1] - self.goal.height_m
+        return min(lower, max(room_m, 0.0)) if lower > 0.0 else 0.0  # NaN is not
 
 
-def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits: Limits) -> Condition:
-    """The condition of a flown orbit, with the angular speed that is flown if the coast limits it."""
-    wanted = abs(goal.angular_speed_rad_s)
-    allowed = coast_speed(seen, limits) / goal.radius_m
-    if present.code not in (ConditionCode.ORBITING, ConditionCode.WIDENED) or allowed >= (1.0 - WORTH_TELLING) * wanted:
-        return present
-    return condition(
-        ConditionCode.SLOWED,
-        cause=present,
-        speed_deg_s=math.degrees(allowed),
-        wanted_deg_s=math.degrees(wanted),
-        limit_m=limits.safety.max_coast_m,
-        timeout_s=_timeout_s(seen),
+def _widened_condition(
+    present: Condition, goal: OrbitGoal, orbit: OrbitState, framed_radius_m: float, config: MavlinkBridgeConfig
+) -> tuple[Condition, OrbitGoal]:
+    """The condition of a flown orbit, with its radius if that is wider than the goal's, and the goal that is flown.
+
+    framed_radius_m : least radius at which one who walks stays in the picture
+    """
+    if present.code != ConditionCode.ORBITING or orbit.goal_radius <= (1.0 + WORTH_TELLING) * goal.radius_m:
+        return present, goal
+    why = _FRAMED if orbit.goal_radius <= framed_radius_m else _CLEAR.format(config.min_distance_m, config.size_error)
+    widened = condition(
+        ConditionCode.WIDENED, cause=present, radius_m=orbit.goal_radius, wanted_m=goal.radius_m, why=why
     )
-
-
-# -- harmless ---------------------------------------------------------------------------------------------------------
+    return widened, goal._replace(radius_m=orbit.goal_radius)
 
 
 class _Coasting(NamedTuple):
@@ -86,7 +190,7 @@ class _Coasting(NamedTuple):
             for vector, *shares in zip(vectors, _shares(along), _shares(across), strict=True)
         )
         part = setpoint._replace(position=here + way, velocity=velocity, acceleration=acceleration)
-        coast = autopilot.coast_of(part, here, seen.vehicle.velocity, _timeout_s(seen))
+        coast = autopilot.coast_of(part, here, seen.vehicle.velocity, timeout_s(seen))
         return part, self.danger(coast), self.too_long(coast, part)
 
     def refined(self, setpoint: Setpoint, levels: tuple[float, float], above: tuple[float, float]) -> Setpoint:
@@ -200,89 +304,6 @@ def _retreats(setpoint: Setpoint, seen: Observed) -> bool:
     """Whether the vehicle is to fly away from the subject."""
     place = seen.subject.position
     return place is not None and float(_commanded(setpoint, seen) @ (place - seen.vehicle.position)[:2]) < 0.0
-
-
-def _timeout_s(seen: Observed) -> float:
-    return seen.autopilot.timeout_s(seen.loss_settings)
-
-
-# -- the closing speed ------------------------------------------------------------------------------------------------
-
-
-class _Closing(NamedTuple):
-    """What bounds the speed towards the subject.
-
-    overshoot : share of the greatest closing speed that a setpoint has: the vehicle overshoots
-    surely_m_s : so much faster than by the estimated place he may recede by his image, which shrinks as he bends
-    far_error_m_s : that his receding must exceed far away: from 12 m one who stands recedes at up to 0.4 m/s
-    step_m_s : most that a setpoint adds to the present closing speed towards one who stands, where setpoints are
-        continued: the vehicle overshoots a larger step
-    stops : share of the speed at which such a vehicle follows a walker, by which it closes up more slowly: a stop is
-        seen 0.4 s late
-    """
-
-    overshoot: float = 0.85
-    surely_m_s: float = 0.1
-    far_error_m_s: float = 0.3
-    step_m_s: float = 0.4
-    stops: float = 0.3
-
-
-_CLOSING = _Closing()
-
-
-def limit_closing(setpoint: Setpoint, seen: Observed, limits: Limits) -> Setpoint:
-    """The setpoint with no more speed towards the subject than his size allows."""
-    sight, orbit = seen.subject.by_size, limits.orbit
-    if sight is None:
-        return setpoint
-    room = math.sqrt(2 * limits.safety.braking_m_s2 * max(sight.nearest_m - orbit.min_distance_m, 0.0))
-    receding = min(sight.receding_m_s, max(-seen.subject.approach_m_s, 0.0) + _CLOSING.surely_m_s)
-    receding = min(receding, max(receding - farness(sight.distance_m) * _CLOSING.far_error_m_s, 0.0))
-    closing_up = _CLOSING.overshoot * orbit.max_closing_m_s
-    allowed = min(max(closing_up + receding, 0.0), room)
-    if seen.autopilot.continues_setpoints:
-        closing = float(seen.vehicle.velocity[:2] @ sight.toward)
-        allowed -= _CLOSING.stops * min(max(receding, 0.0), closing_up)
-        # Its path, limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.3 m/s without this.
-        allowed += min(closing, 0.0)
-        allowed = max(min(allowed, max(closing, 0.0) + _CLOSING.step_m_s + receding), 0.0)
-    return _bounded(setpoint, seen, sight, allowed, orbit.max_acceleration_m_s2)
-
-
-def _bounded(
-    setpoint: Setpoint, seen: Observed, sight: SizeSight, allowed_m_s: float, max_acceleration_m_s2: float
-) -> Setpoint:
-    """The setpoint with no more speed towards the subject than allowed.
-
-    The autopilot flies the setpoint's velocity and a share of the way to its position; their sum is bounded, at the
-    cost of the position first.  Acceleration towards the subject turns the vehicle on its circle, and beyond that
-    brings the present closing speed to the allowed one.
-    """
-    vehicle, gain = seen.vehicle, seen.autopilot.position_gain_per_s
-    inward = np.append(sight.toward, 0.0)
-    ahead, speed = float((setpoint.position - vehicle.position) @ inward), float(setpoint.velocity @ inward)
-    excess = speed + gain * ahead - allowed_m_s
-    place, flown = setpoint.position, setpoint.velocity
-    if excess > 0:
-        back = min(excess / gain, max(ahead, 0.0))
-        place = place - back * inward
-        flown = flown - min(excess - gain * back, max(speed, 0.0)) * inward
-    velocity = vehicle.velocity
-    closing = float(velocity @ inward)
-    turning = max(float(velocity[:2] @ velocity[:2]) - closing**2, 0.0) / max(sight.distance_m, 0.5)
-    most = max(turning + (allowed_m_s - closing) / REACTION_S, -max_acceleration_m_s2)
-    acceleration = setpoint.acceleration - max(float(setpoint.acceleration @ inward) - most, 0.0) * inward
-    size = float(np.linalg.norm(acceleration))
-    acceleration = acceleration * min(1.0, max_acceleration_m_s2 / max(size, 1e-6))
-    return setpoint._replace(position=place, velocity=flown, acceleration=acceleration)
-
-
-# -- what a vehicle behind a walker lacks -----------------------------------------------------------------------------
-
-_RATE_PER_S2 = 0.8  # of the missing velocity
-_FORGETTING_PER_S = 0.1  # of what was missing: gusts pass
-_MOST_M_S2 = 0.6  # that is added behind one who walks, 1 m/s faster than one seems to who stands: he needs none
 
 
 class Shortfall:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
-from drocap_ros.reconstruction.common.line_search import search_line
+from drocap_ros.reconstruction.common.engine import search_line
 
 
 class Point(NamedTuple):

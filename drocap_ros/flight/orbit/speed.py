@@ -1,0 +1,277 @@
+"""How fast the orbit is flown: every rule, in the order in which they bound a setpoint.
+
+1. :func:`coast_speed`: a vehicle without setpoints must stand within ``max_coast_m``.
+2. :func:`allowed_angular_speed`: of the reference, by speed and acceleration at its radius; :func:`waiting`, for the
+   vehicle; :func:`approach_speed` of the radius.  The ramps to them are those of ``planner.py``.
+3. :func:`allowed_pace`: old data slow the orbit down, at once; fresh data restore the speed that is left, and the rest
+   along a ramp.  The pace is the share of its speed at which it is flown: the time of the reference runs slower by this
+   factor.  At pace 0 the setpoint stands where the vehicle was; only the ages of ``motion_checks.py`` end the orbit.
+4. :func:`limit_closing`: the speed towards the subject, by the size of his image.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.autopilot.autopilot import Autopilot
+from drocap_ros.flight.autopilot.coasting import Setpoint
+from drocap_ros.flight.bridge_config import WORTH_TELLING, OrbitConfig, OrbitGoal
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.observed import Observed, SizeSight
+from drocap_ros.flight.orbit.motion_checks import (
+    GUST_S,
+    REACTION_S,
+    WAITING_LEADS,
+    keeping_condition,
+    oldest_state_s,
+    oldest_subject_s,
+    outdated_condition,
+)
+from drocap_ros.flight.orbit.states import Limits, Pace
+from drocap_ros.flight.subject.guard import farness
+
+_C = ConditionCode
+_FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
+_USUAL_SUBJECT_AGE_S = 0.24  # a camera at 15 Hz, and 0.17 s for its network
+_STANDING_AGE = 5 / 6  # of max_subject_age_s, 0.33 s: the last moving setpoint
+_LEAST_PACE = 0.3  # share of its speed at which an orbit gives way still: one that stands would not
+_CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
+
+
+# -- if no setpoint follows --------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def greatest_speed(autopilot: Autopilot, timeout_s: float, longest_m: float) -> float:
+    """Greatest speed in m/s at which a level flight straight ahead stops within ``longest_m``."""
+    low, high = 0.0, 20.0
+    while high - low > 0.01:
+        speed = 0.5 * (low + high)
+        velocity, zero = np.array([speed, 0.0, 0.0]), np.zeros(3)
+        last = Setpoint(zero, velocity, zero, 0.0, 0.0)
+        if autopilot.coast_of(last, zero, velocity, timeout_s).length_m > longest_m:
+            high = speed
+        else:
+            low = speed
+    return low
+
+
+def timeout_s(seen: Observed) -> float:
+    """For how long (s) the vehicle flies on without setpoints."""
+    return seen.autopilot.timeout_s(seen.loss_settings)
+
+
+def coast_speed(seen: Observed, limits: Limits) -> float:
+    """Speed in m/s of a steady flight whose coast leaves room to ``max_coast_m``."""
+    autopilot = seen.autopilot
+    return greatest_speed(autopilot, timeout_s(seen), autopilot.coast.steady * limits.safety.max_coast_m)
+
+
+def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits: Limits) -> Condition:
+    """The condition of a flown orbit, with the angular speed that is flown if the coast limits it."""
+    wanted = abs(goal.angular_speed_rad_s)
+    allowed = coast_speed(seen, limits) / goal.radius_m
+    if present.code not in (ConditionCode.ORBITING, ConditionCode.WIDENED) or allowed >= (1.0 - WORTH_TELLING) * wanted:
+        return present
+    return condition(
+        ConditionCode.SLOWED,
+        cause=present,
+        speed_deg_s=math.degrees(allowed),
+        wanted_deg_s=math.degrees(wanted),
+        limit_m=limits.safety.max_coast_m,
+        timeout_s=timeout_s(seen),
+    )
+
+
+# -- of the reference -------------------------------------------------------------------------------------------------
+
+
+def allowed_angular_speed(
+    wanted: float, radius: float, moving: np.ndarray, along: np.ndarray, greatest: float, config: OrbitConfig
+) -> float:
+    """Wanted angular speed in rad/s, limited by speed and acceleration at this radius.
+
+    moving : (2,) m/s, what the orbit adds to: of the centre and of the radius
+    along : (2,) direction in which it adds
+    """
+    by_acceleration = math.sqrt(config.max_acceleration_m_s2 / radius)
+    ahead = float(moving @ along)
+    room = greatest**2 - float(moving @ moving) + ahead**2
+    by_speed = max(math.sqrt(max(room, 0.0)) - ahead, 0.0) / radius
+    return math.copysign(min(abs(wanted), by_acceleration, by_speed), wanted)
+
+
+def waiting(lead_m: float, most_m: float) -> tuple[float, float]:
+    """Shares of its speed to which, and at once at which, the reference slows down ahead of a vehicle that lags behind.
+
+    The ramp to the first one is too slow for a vehicle that suddenly falls behind.
+    """
+    share = (most_m - lead_m) / ((1 - _FREE_LEAD) * most_m)
+    at_once = (WAITING_LEADS * most_m - lead_m) / (0.3 * most_m)  # from one greatest lead to 1.3 of them
+    return min(max(share, 0.0), 1.0), min(max(at_once, 0.0), 1.0)
+
+
+def approach_speed(radius_m: float, chase_m_s: float, config: OrbitConfig) -> float:
+    """Speed of radius changes: slower behind a subject that walks away, because it may stop at once."""
+    room = max(radius_m - config.min_distance_m, 0.0)
+    return min(max(math.sqrt(room) - chase_m_s, 0.2), config.approach_speed_m_s)
+
+
+# -- by the age of the data -------------------------------------------------------------------------------------------
+
+
+class Allowed(NamedTuple):
+    """The pace that the data allow, 0 to 1, and the condition that reduces it."""
+
+    pace: float
+    cause: Condition | None
+
+
+def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
+    """The pace by the greatest age, relative to its limits, of subject, attitude, position and link."""
+    safety = limits.safety
+    usual_s = safety.max_state_age_s
+    halt_s = 0.5 * (usual_s + oldest_state_s(safety, patient=True))
+    subject_s = min(oldest_subject_s(seen, safety), _STANDING_AGE * safety.max_subject_age_s)
+    usual_subject_s = min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s)
+    allowed = Allowed(1.0, None)
+    if seen.subject.contradicted:  # at once: most of what is flown after a jump is flown before the hold
+        allowed = Allowed(_LEAST_PACE, condition(_C.OTHER_SUBJECT, age_s=seen.subject.age_s))
+    pace = _share(seen.subject.age_s, usual_subject_s, subject_s)
+    if pace < allowed.pace:
+        allowed = Allowed(pace, outdated_condition(seen, usual_subject_s))
+    for age_s, code in (
+        (seen.link.age_s, _C.LINK_SILENT),
+        (seen.vehicle.age_s, _C.ATTITUDE_OUTDATED),
+        (seen.vehicle.position_age_s, _C.POSITION_FROZEN),
+    ):
+        pace = _share(age_s, usual_s, halt_s)
+        if pace < allowed.pace:
+            allowed = Allowed(pace, condition(code, age_s=age_s))
+    if allowed.cause is None:  # the reference waits by itself
+        allowed = allowed._replace(cause=keeping_condition(seen, limits, GUST_S))
+    return allowed
+
+
+def _share(age_s: float, full_s: float, none_s: float) -> float:
+    """1 up to the one age, 0 from the other one on."""
+    if age_s <= full_s:
+        return 1.0
+    return max(none_s - age_s, 0.0) / (none_s - full_s) if none_s > full_s else 0.0
+
+
+def next_pace(
+    pace: Pace, allowed: float, now_s: float, vehicle: np.ndarray | None = None, *, contradicted: bool = False
+) -> Pace:
+    """The pace now: at most the allowed one, and at most the one that the vehicle has kept meanwhile.
+
+    A vehicle does not lose its speed at once: after a short gap the orbit goes on from the speed that is left.  After
+    a stand for pictures of something else it goes on along the whole ramp: the subject may be at another place.
+
+    vehicle : (3,) m, its position
+    contradicted : whether the pictures show something else
+    """
+    dt = now_s - pace.at_s
+    kept = min(max(allowed, pace.kept - _CHANGE * dt), pace.kept + _CHANGE * dt)
+    value = min(allowed, kept)
+    if contradicted and value == 0.0:
+        kept = 0.0
+    place = vehicle if value > 0.0 or pace.place is None else pace.place
+    return Pace(value, (kept - pace.kept) / dt if dt > 0.0 else 0.0, kept, now_s, place)
+
+
+def slowed(setpoint: Setpoint, pace: Pace, max_acceleration_m_s2: float) -> Setpoint:
+    """The setpoint of a reference whose time runs at this pace; a change of the pace is an acceleration.
+
+    None at pace 0: an autopilot integrates the acceleration, and the setpoint stands where the vehicle was.
+    """
+    if pace.value == 1.0 and pace.rate == 0.0:
+        return setpoint
+    if pace.place is not None:
+        way = min(pace.value / _LEAST_PACE, 1.0)  # below it the setpoint is nearer than the reference
+        setpoint = setpoint._replace(position=pace.place + way * (setpoint.position - pace.place))
+    acceleration = pace.value**2 * setpoint.acceleration
+    if pace.value > 0.0:
+        acceleration = acceleration + pace.rate * setpoint.velocity
+    size = float(np.linalg.norm(acceleration))
+    return setpoint._replace(
+        velocity=pace.value * setpoint.velocity,
+        acceleration=acceleration * min(1.0, max_acceleration_m_s2 / max(size, 1e-9)),
+        yaw_rate=pace.value * setpoint.yaw_rate,
+    )
+
+
+# -- towards the subject ----------------------------------------------------------------------------------------------
+
+
+class _Closing(NamedTuple):
+    """What bounds the speed towards the subject.
+
+    overshoot : share of the greatest closing speed that a setpoint has: the vehicle overshoots
+    surely_m_s : so much faster than by the estimated place he may recede by his image, which shrinks as he bends
+    far_error_m_s : that his receding must exceed far away: from 12 m one who stands recedes at up to 0.4 m/s
+    step_m_s : most that a setpoint adds to the present closing speed towards one who stands, where setpoints are
+        continued: the vehicle overshoots a larger step
+    stops : share of the speed at which such a vehicle follows a walker, by which it closes up more slowly: a stop is
+        seen 0.4 s late
+    """
+
+    overshoot: float = 0.85
+    surely_m_s: float = 0.1
+    far_error_m_s: float = 0.3
+    step_m_s: float = 0.4
+    stops: float = 0.3
+
+
+_CLOSING = _Closing()
+
+
+def limit_closing(setpoint: Setpoint, seen: Observed, limits: Limits) -> Setpoint:
+    """The setpoint with no more speed towards the subject than his size allows."""
+    sight, orbit = seen.subject.by_size, limits.orbit
+    if sight is None:
+        return setpoint
+    room = math.sqrt(2 * limits.safety.braking_m_s2 * max(sight.nearest_m - orbit.min_distance_m, 0.0))
+    receding = min(sight.receding_m_s, max(-seen.subject.approach_m_s, 0.0) + _CLOSING.surely_m_s)
+    receding = min(receding, max(receding - farness(sight.distance_m) * _CLOSING.far_error_m_s, 0.0))
+    closing_up = _CLOSING.overshoot * orbit.max_closing_m_s
+    allowed = min(max(closing_up + receding, 0.0), room)
+    if seen.autopilot.continues_setpoints:
+        closing = float(seen.vehicle.velocity[:2] @ sight.toward)
+        allowed -= _CLOSING.stops * min(max(receding, 0.0), closing_up)
+        # Its path, limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.3 m/s without this.
+        allowed += min(closing, 0.0)
+        allowed = max(min(allowed, max(closing, 0.0) + _CLOSING.step_m_s + receding), 0.0)
+    return _bounded(setpoint, seen, sight, allowed, orbit.max_acceleration_m_s2)
+
+
+def _bounded(
+    setpoint: Setpoint, seen: Observed, sight: SizeSight, allowed_m_s: float, max_acceleration_m_s2: float
+) -> Setpoint:
+    """The setpoint with no more speed towards the subject than allowed.
+
+    The autopilot flies the setpoint's velocity and a share of the way to its position; their sum is bounded, at the
+    cost of the position first.  Acceleration towards the subject turns the vehicle on its circle, and beyond that
+    brings the present closing speed to the allowed one.
+    """
+    vehicle, gain = seen.vehicle, seen.autopilot.position_gain_per_s
+    inward = np.append(sight.toward, 0.0)
+    ahead, speed = float((setpoint.position - vehicle.position) @ inward), float(setpoint.velocity @ inward)
+    excess = speed + gain * ahead - allowed_m_s
+    place, flown = setpoint.position, setpoint.velocity
+    if excess > 0:
+        back = min(excess / gain, max(ahead, 0.0))
+        place = place - back * inward
+        flown = flown - min(excess - gain * back, max(speed, 0.0)) * inward
+    velocity = vehicle.velocity
+    closing = float(velocity @ inward)
+    turning = max(float(velocity[:2] @ velocity[:2]) - closing**2, 0.0) / max(sight.distance_m, 0.5)
+    most = max(turning + (allowed_m_s - closing) / REACTION_S, -max_acceleration_m_s2)
+    acceleration = setpoint.acceleration - max(float(setpoint.acceleration @ inward) - most, 0.0) * inward
+    size = float(np.linalg.norm(acceleration))
+    acceleration = acceleration * min(1.0, max_acceleration_m_s2 / max(size, 1e-6))
+    return setpoint._replace(position=place, velocity=flown, acceleration=acceleration)
