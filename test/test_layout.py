@@ -12,7 +12,7 @@ import pytest
 #: Bottom to top; a room imports rooms of its own layer or below.
 LAYERS = (
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
-     "observation", "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind"),
+     "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
     ("open_images", "api", "config", "pipeline", "people", "together", "live_replay", "evaluation", "export", "report",
      "view"),
@@ -27,7 +27,7 @@ MAX_LINES = 450
 #: it makes needless; who raises a budget writes the reason beside the number.  The plan is issue 45's.
 BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
-     "observation", "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
+     "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "together", "live_replay"): 4.0,  # 1.3 over the plan: history, stamps,
     # places on the Earth and images came down; points of the scene in a tracks file (0.15), of a live stream (0.05);
     # evidence, lens, shoulders, a camera (0.05); numbers of persons in a part (0.02);

@@ -10,10 +10,9 @@ import numpy as np
 
 from drocap_ros.background import MOST_ROWS, of_images
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.pinhole import assumed_camera, towards
-from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.geometry.rotations import assumed_camera, towards
+from drocap_ros.keypoints import Keypoints2D, PoseObservation
 from drocap_ros.leg_sides import with_own_legs
-from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.sources.base import Frame, prefetch, with_next
 from drocap_ros.tracks import Tracks

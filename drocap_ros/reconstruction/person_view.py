@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drocap_ros.geometry.pinhole import centred_camera, towards
-from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.geometry.rotations import centred_camera, exp_so3, towards
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.lifter_input import centre_of

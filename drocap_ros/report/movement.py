@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.rotations import unpack_covariance
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.report.statistics import Statistics
 from drocap_ros.skeleton import indices

@@ -10,7 +10,7 @@ from types import TracebackType
 
 import numpy as np
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.persons import FoundPerson
 from drocap_ros.perception.sources.base import Frame
 from drocap_ros.report.video_file import VideoFile

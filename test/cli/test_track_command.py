@@ -12,7 +12,7 @@ import pytest
 from rendered_person import rendered_images
 
 from drocap_ros.cli import main
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.sources import Frame
 from drocap_ros.report.overlay import OverlayVideo
 from drocap_ros.tracks import load_tracks

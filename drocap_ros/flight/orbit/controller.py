@@ -45,7 +45,7 @@ from drocap_ros.flight.orbit.states import (
 )
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 
 _STANDING_M_S = 0.05  # speed below which a setpoint stands
 _GIMBAL_PERIOD_S = 0.5  # between pitches of the mount: radius and height change slowly

@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from drocap_ros.geometry.bones import pair_lengths
+from drocap_ros.geometry.alignment import pair_lengths
 from drocap_ros.reconstruction.common.engine import (
     Equations,
     add_second_difference,

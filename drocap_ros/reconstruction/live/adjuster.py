@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.alignment import limb_lengths
+from drocap_ros.geometry.rotations import unpack_covariance
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig

@@ -8,8 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import Keypoints2D, PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.window import Window
 from drocap_ros.reconstruction.person_view import assumed_focal_px

@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.camera_path import CameraPath
-from drocap_ros.geometry.bones import bone_lengths
-from drocap_ros.geometry.ellipsoids import unpack_covariance
-from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.geometry.alignment import bone_lengths
+from drocap_ros.geometry.rotations import exp_so3, unpack_covariance
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.reconstruction.world.world_model import MEASURED

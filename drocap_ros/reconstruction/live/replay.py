@@ -14,7 +14,7 @@ import numpy as np
 from drocap_ros.background import Background
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.errors import InputError
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer

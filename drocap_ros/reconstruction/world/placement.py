@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.contacts import rest_likelihood
-from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
+from drocap_ros.geometry.alignment import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.reconstruction.world.world_model import MEASURED
 from drocap_ros.skeleton import BODY_15
 

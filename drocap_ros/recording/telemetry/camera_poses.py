@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.vehicle_state import camera_rotation, quaternion_from_euler
-from drocap_ros.geometry.interpolation import interpolate, true_runs
-from drocap_ros.geometry.position_steps import without_steps
+from drocap_ros.geometry.interpolation import interpolate, true_runs, without_steps
 from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import VehicleTrack
 from drocap_ros.tracks import Tracks

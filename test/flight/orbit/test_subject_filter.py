@@ -10,7 +10,7 @@ from drocap_ros.flight.subject.subject_measurement import locate_subject
 from drocap_ros.flight.vehicle_filter import CameraPose, PoseHistory, VehicleFilter
 from drocap_ros.flight.vehicle_state import OPTICAL_FROM_FLU, VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.skeleton import BODY_15
 

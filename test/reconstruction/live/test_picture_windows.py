@@ -15,7 +15,7 @@ from drocap_ros.background import Background
 from drocap_ros.evaluation.compare import world_errors
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.camera_history import CameraHistory
-from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.rotations import unpack_covariance
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.replay import LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import Effort, TelemetryUse

@@ -17,7 +17,7 @@ from drocap_ros.camera_path import CameraPath
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.rotations import exp_so3, log_so3, quaternion_from_matrix
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.camera.fusion import Fusion, fuse_telemetry
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.refusal import Refusal
