@@ -11,8 +11,8 @@ import numpy as np
 from drocap_ros.clip import Progress
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.report.motion_images import Box, FollowingBox, each_image
+from drocap_ros.report.overlay import VideoFile
 from drocap_ros.report.statistics import Statistics, motion_statistics, smooth
-from drocap_ros.report.video_file import VideoFile
 from drocap_ros.skeleton import side_of
 
 #: Sides of both panes, px.
