@@ -86,8 +86,6 @@ def reconstruct_input(
 ) -> tuple[Motion, Tracks]:
     """Motion of the subject in a video file, image folder, recording or tracks file.
 
-    Parameters
-    ----------
     path : video, folder of images, ``.mcap``, rosbag1 ``.bag``, rosbag2 folder, or tracks ``.npz``
     method : one of :data:`drocap_ros.reconstruction.methods.METHODS`, or "live": the sliding windows of the live
         graph on a recording with ``pose2d``, with the recorded parameters unless ``config`` differs from the defaults

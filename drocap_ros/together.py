@@ -27,8 +27,6 @@ def reconstruct_together(
 ) -> list[tuple[Motion, Tracks]]:
     """The one motion that several recordings of a person show, as each recording's camera sees it, and their tracks.
 
-    Parameters
-    ----------
     paths : inputs of :func:`reconstruct_input`, two at least; the times of the first one's images are those of all
     telemetry : none, or that which the recordings have with them
     """

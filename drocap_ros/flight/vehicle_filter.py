@@ -28,8 +28,6 @@ class CameraPose(NamedTuple):
 class PoseHistory:
     """States of the last seconds, by their stamps.
 
-    Parameters
-    ----------
     keep_s : how far back
     """
 
@@ -116,8 +114,6 @@ class Doubt(NamedTuple):
 class VehicleFilter:
     """Reports of one flight, in the order of their stamps.
 
-    Parameters
-    ----------
     velocity_sd_m_s : of the reported velocity, until the flight has shown it
 
     Attributes

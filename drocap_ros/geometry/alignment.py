@@ -33,8 +33,6 @@ def similarity(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Best similarity transformation without reflection (Umeyama 1991), per leading index.
 
-    Parameters
-    ----------
     source, target : (..., P, 3)
     with_scale : False for a rigid motion
 
@@ -69,8 +67,6 @@ def apply_similarity(
 def torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:
     """Body-fixed frame of each pose: x forward, y left, z up along the trunk.
 
-    Parameters
-    ----------
     s : (..., P, 3), any right-handed frame and unit
 
     Returns
@@ -98,8 +94,6 @@ def unit_or(v: np.ndarray, fallback: np.ndarray) -> np.ndarray:
 def to_torso_frame(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split poses into body-fixed shapes and the rotation of the body.
 
-    Parameters
-    ----------
     s : (..., P, 3) of BODY_15, for example in the camera's frame
 
     Returns

@@ -24,8 +24,6 @@ _GAP_NS = round(MAX_GAP_S * 1e9)
 class CameraHistory:
     """Takes reported poses and calibrations in the order of their arrival; the same order gives the same answers.
 
-    Parameters
-    ----------
     keep_s : length of the longest window
     """
 

@@ -30,8 +30,6 @@ def observe(
     With two or more, one decodes ahead and one follows the scene of the next image, and runs the detector in it where
     this image needed it, while this one estimates the pose: each of them needs its own result of the last image.
 
-    Parameters
-    ----------
     frames : a source, or frames in the order of time
     estimator : a fresh one; it keeps its subject between calls
     on_frame : called with each frame and its observation, for progress and overlays

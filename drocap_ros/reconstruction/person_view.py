@@ -99,8 +99,6 @@ def person_view(
 ) -> PersonView | None:
     """The view of a sequence; None where neither lens nor attitude of the camera is known: the image itself.
 
-    Parameters
-    ----------
     keypoints : (F, P) px in the image, of a body set of 17 joints at most
     matrix : (3, 3) px of the camera; None = unknown
     rotation : (F, 3, 3) world (z up) -> camera; None = unknown

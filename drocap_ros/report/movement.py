@@ -23,8 +23,6 @@ _CHAINS = {"knee": ("hip", "knee", "ankle"), "elbow": ("shoulder", "elbow", "wri
 def flexion(joints: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """(F, 2) degrees of the right and the left knee, hip and elbow; NaN where a joint is.
 
-    Parameters
-    ----------
     joints : (F, P, 3), any unit and frame
     names : (P,) of the joints
     """

@@ -28,10 +28,7 @@ _RATES_HZ, _DENOMINATOR = (1.0, 120.0), 1_000_000
 class VideoFile:
     """One MP4 file of images (H, W, 3) uint8 BGR, a context manager; an error inside it ends the file.
 
-    Raises
-    ------
-    DrocapError
-        When the file cannot be written.
+    Raises DrocapError when the file cannot be written.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], rate_hz: float) -> None:

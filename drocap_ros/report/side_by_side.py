@@ -43,12 +43,7 @@ def save_side_by_side(path: Path, motion: Motion, video: Path, progress: Progres
     video : source of the motion
     progress : takes the stage's name and its share
 
-    Raises
-    ------
-    InputError
-        When the motion holds no pose, or the video cannot be used.
-    DrocapError
-        When the file cannot be written.
+    Raises DrocapError when the file cannot be written.
     """
     pictures = _pictures(motion, video, progress)
     first, rate_hz = next(pictures)

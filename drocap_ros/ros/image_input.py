@@ -79,8 +79,6 @@ class ImageInput:
 
     In simulated time it processes each image on arrival: however long that takes, no image waits or is dropped.
 
-    Parameters
-    ----------
     node : the node that subscribes
     process : called in that thread with a sample; an InputError is counted, any other error ends the node
     decode : CompressedImage -> image; may raise InputError

@@ -35,8 +35,6 @@ class LoadShedding:
     def level(self, now_s: float, queued: bool, backlog: int) -> int:
         """Level for the current image.
 
-        Parameters
-        ----------
         now_s : monotonic time
         queued : whether the image arrived while the previous one was processed
         backlog : number of images still queued

@@ -32,8 +32,6 @@ LEAN = {
 class OwnProcess(Generic[_P, _R]):
     """A function, or a method whose object lives on there, with one BLAS thread: results are those of this process.
 
-    Parameters
-    ----------
     call : with its object, its arguments and its results it can be pickled
 
     The package's messages are those of the level that this process has now.
@@ -51,10 +49,7 @@ class OwnProcess(Generic[_P, _R]):
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         """The result of a call, or its error; one thread calls at a time.
 
-        Raises
-        ------
-        NodeError
-            When the process has died.
+        Raises NodeError when the process has died.
         """
         result: _R
         try:

@@ -39,8 +39,6 @@ logger = logging.getLogger(__name__)
 class MavlinkLink:
     """Link to one autopilot.  Use as a context manager, and either call :meth:`spin_once` or :meth:`run`.
 
-    Parameters
-    ----------
     config : where to connect, what to request
     clock_ns : our clock, ns; that of the stamps
     monotonic_s : clock of the periods and of silence
@@ -123,10 +121,7 @@ class MavlinkLink:
 
         A process that was stopped within a control step continues with its setpoint of that time.
 
-        Raises
-        ------
-        AssertionError
-            When motion is not enabled, or the message is not on the list: an error in the program.
+        Raises AssertionError when motion is not enabled, or the message is not on the list: an error in the program.
         """
         self.check_motion(message)
         with self._lock:

@@ -28,8 +28,6 @@ _SERVO_DELAY_S = 0.05
 class Mount:
     """The camera's attitude at each attitude of the body.
 
-    Parameters
-    ----------
     kind : one of ``subject_config.MOUNT_KINDS``
     pitch_deg : of a fixed camera against the body, negative = down
     """

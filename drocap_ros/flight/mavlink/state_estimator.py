@@ -40,8 +40,6 @@ class VehicleStateEstimator:
     The first autopilot (or the configured one) is the vehicle; messages of other systems are ignored.  It reads no
     clock: each message comes with its time of reception.
 
-    Parameters
-    ----------
     target_system_id : MAVLink system of the vehicle; 0 = the first autopilot
     camera_mount : kind of the camera's mount; None = as the autopilot describes it
     """

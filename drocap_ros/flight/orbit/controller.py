@@ -55,8 +55,6 @@ _MODE_AGE_STEPS = 1.5  # a report of the mode is seen in the step that follows i
 class OrbitController:
     """Flies the orbit through a link.  States, images and commands may come from other threads than the steps.
 
-    Parameters
-    ----------
     link : to the autopilot; it sends motion only with ``commands_enabled``
     watchdog : gets the fallback commands of every step, when given
     """
@@ -109,8 +107,6 @@ class OrbitController:
     def step(self, now_ns: int, now_s: float) -> ControlStatus:
         """One step of the control loop.
 
-        Parameters
-        ----------
         now_ns : clock of the stamps
         now_s : monotonic
         """

@@ -47,8 +47,6 @@ class Echoes(NamedTuple):
 class Following:
     """Judges an orbit step by step.
 
-    Parameters
-    ----------
     max_echo_age_s : time without any echo after which the setpoints count as not followed
     """
 
@@ -60,8 +58,6 @@ class Following:
     def step(self, now_s: float, orbiting_s: float, echoes: Echoes, vehicle: VehicleState | None) -> str:
         """Why the setpoints count as not followed, in words; "" = they are followed, or it is not known.
 
-        Parameters
-        ----------
         now_s : monotonic
         orbiting_s : how long the orbit has been flown; 0 = it is not
         """

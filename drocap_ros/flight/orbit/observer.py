@@ -116,8 +116,6 @@ class Observer:
     def observe(self, link: MavlinkLink, now_ns: int, now_s: float, own: OwnFlight) -> tuple[Observed, float]:
         """The observation of a step, and the time in s since the last one.
 
-        Parameters
-        ----------
         now_ns : clock of the stamps
         now_s : monotonic
         """

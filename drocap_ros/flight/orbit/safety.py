@@ -60,8 +60,6 @@ def reduce(
 ) -> tuple[SafetyState, Decision]:
     """One step of the machine.
 
-    Parameters
-    ----------
     now_s : monotonic
     command : the operator's, or None
 

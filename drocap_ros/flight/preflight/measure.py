@@ -97,8 +97,6 @@ class ListeningLink(MavlinkLink):
 class Listening:
     """One session of listening: :meth:`turn` again and again until :attr:`done`, then :meth:`measured`.
 
-    Parameters
-    ----------
     seconds : since the first message of the autopilot; without one, since the beginning
     keywords : of :class:`MavlinkLink`
     """

@@ -50,8 +50,6 @@ def framing_margin(
 ) -> np.ndarray:
     """(N,) distance of the person from the nearest border, as a share of the picture's height; negative = outside.
 
-    Parameters
-    ----------
     distance_m : horizontal, along the nose
     height_m : of the camera above the person's ground
     ahead, left : (N,) rad, lean of the body: nose down, left side down

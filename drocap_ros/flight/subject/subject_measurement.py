@@ -97,8 +97,6 @@ def locate_subject(
 ) -> SubjectMeasurement | None:
     """Locate the subject in one image.
 
-    Parameters
-    ----------
     observation : keypoints of any joint set that maps to ``BODY_15``
     camera_matrix : (3, 3) px
     camera : pose at the stamp of the observation

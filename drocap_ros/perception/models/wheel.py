@@ -36,12 +36,7 @@ class Package:
 def fetch_member(package: Package, member: str, target: Path) -> None:
     """A file of a package, written to ``target``; pip downloads the wheel as this machine is set up, checks its sum.
 
-    Raises
-    ------
-    InputError
-        When there is no pip.
-    FetchError
-        When pip cannot fetch the wheel of that sum.
+    Raises FetchError when pip cannot fetch the wheel of that sum.
     """
     with tempfile.TemporaryDirectory() as name:
         listed = Path(name) / "requirements.txt"

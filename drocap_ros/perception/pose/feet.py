@@ -31,8 +31,6 @@ class FeetModel:
     def add(self, image: np.ndarray, box: np.ndarray, pose: BodyPose) -> BodyPose:
         """The pose with ``BODY_19``: a foot where both networks see its ankle in one place, else it is not seen.
 
-        Parameters
-        ----------
         image : (H, W, 3) uint8 BGR
         box : (4,) px of the person, where the joints of ``pose`` give none
         """

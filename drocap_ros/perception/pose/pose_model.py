@@ -49,8 +49,6 @@ class PoseModel:
     def estimate(self, image: np.ndarray, box: np.ndarray) -> NetworkKeypoints:
         """Keypoints of the person in a box.
 
-        Parameters
-        ----------
         image : (H, W, 3) uint8 BGR
         box : (4,) x_min y_min x_max y_max px; may extend beyond the image
         """

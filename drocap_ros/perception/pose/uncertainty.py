@@ -57,8 +57,6 @@ _FLOOR_PX = 0.3
 def calibrate(keypoints: NetworkKeypoints, layout: str, sigma_scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Covariance and confidence of one person's keypoints.
 
-    Parameters
-    ----------
     keypoints : P joints
     layout : of the pose model's outputs
     sigma_scale : standard deviations of this model over those of the models of the fit

@@ -225,8 +225,6 @@ def adjust(
 ) -> AdjustmentSolution:
     """Minimise the cost.
 
-    Parameters
-    ----------
     joints : (F, 17, 3) mm, initial; the signs of depth stay as they are
     iterations : most accepted steps
     tolerance : relative decrease of the cost that ends the solve; on MoCap, poses err as with a third of it

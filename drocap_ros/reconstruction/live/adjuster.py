@@ -52,8 +52,6 @@ class LiveAdjuster:
     ) -> AdjustedWindow:
         """Adjust a window.
 
-        Parameters
-        ----------
         effort : limits of the work; None = no limit beyond the configuration
         cancelled : as of :func:`~drocap_ros.reconstruction.lifted.method.solve_even_window`; the result's
             ``effort`` holds the steps taken and repeats the result

@@ -70,8 +70,6 @@ class StreamOrder:
       harm, and a whole stream in 1970 or 2100 works.
     - Another ``track_id`` or image size: the stream restarts.  More than ``gap_s`` later: a gap.
 
-    Parameters
-    ----------
     confirm : False accepts every jump at once, for images that another order has accepted
     """
 

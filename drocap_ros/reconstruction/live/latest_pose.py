@@ -84,8 +84,6 @@ class LatestPlace:
     ) -> PlacedPose | None:
         """The image's pose in ``map``; None without a solution there, the camera's pose or enough keypoints.
 
-        Parameters
-        ----------
         pose : joints (P, 3) m and covariance (P, 6) m^2 in camera axes, pelvis at the origin
         keypoints : (P, 2) px, NaN where not seen
         camera : as reported at this image alone

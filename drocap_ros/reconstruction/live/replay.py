@@ -52,8 +52,6 @@ def live_poses(
 ) -> Iterator[LivePose | LiveWindow]:
     """Poses and windows in the order of the live graph; memory is that of one window.
 
-    Parameters
-    ----------
     observations : in the order of their messages; those that the nodes drop are skipped
     effort_at : gives by the stamp of a window's newest image the effort of the live graph, None where it skipped the
         window (one is skipped while another is running); without it all windows that are due, with full effort

@@ -79,8 +79,6 @@ class Effort:
 class EffortControl:
     """Chooses the stride of the next window from the duration of the last adjustment.
 
-    Parameters
-    ----------
     allowed_s : for one adjustment
     max_stride : the coarsest
     """

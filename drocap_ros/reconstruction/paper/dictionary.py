@@ -57,8 +57,6 @@ class Dictionary:
 def normalize_poses(x: np.ndarray) -> np.ndarray:
     """MoCap poses in the dictionary's frame and scale.
 
-    Parameters
-    ----------
     x : (N, 15, 3) joints of BODY_15, any right-handed frame and unit
 
     Returns

@@ -50,8 +50,6 @@ class Placement(NamedTuple):
 def place_view(first: View, second: View, offset_s: float, upright: bool) -> Placement:
     """Where the second view's world lies in the first's.
 
-    Parameters
-    ----------
     offset_s : time of the first less that of the second
     upright : both worlds know up, so they differ by a turn about it
     """

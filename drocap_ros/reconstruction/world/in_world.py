@@ -46,8 +46,6 @@ def in_world(
 ) -> WorldResult:
     """Poses placed by the camera's rotation and, with its position and matrix, adjusted with it.
 
-    Parameters
-    ----------
     keypoints : of the method's joints
     per_px : (F,) metres per px at the assumed stature
     config : of the adjustment; None = the poses are placed alone

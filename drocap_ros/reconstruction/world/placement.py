@@ -44,8 +44,6 @@ class ScaleEstimate:
 def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.ndarray) -> ScaleEstimate | None:
     """Scale at which the feet are still.
 
-    Parameters
-    ----------
     feet : (F, N, 3) m at the assumed scale, camera to foot, world axes
     camera_position : (F, 3) m, world axes
     stamp_ns : (F,)

@@ -71,8 +71,6 @@ def with_camera(
 ) -> tuple[Tracks, str]:
     """Tracks with the camera's pose at each image, and as text what is missing; see :func:`camera_poses`.
 
-    Parameters
-    ----------
     at_ns : (F,) times of the images by the clock of the vehicle's states
     """
     poses = camera_poses(vehicle, at_ns, mount_pitch_deg)

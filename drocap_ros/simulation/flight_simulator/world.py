@@ -140,8 +140,6 @@ class Exposure(NamedTuple):
 class FlightWorld:
     """Stepped in time; keeps its exposures as the truth.
 
-    Parameters
-    ----------
     transport : the vehicle's end of the MAVLink link; closed by :meth:`close`
     """
 

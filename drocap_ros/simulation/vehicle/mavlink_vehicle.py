@@ -47,8 +47,6 @@ class FlightPath(Protocol):
 class SampledPath:
     """Path through sampled camera poses: the camera is at the vehicle's position, the nose follows its bearing.
 
-    Parameters
-    ----------
     t_s : (F,) increasing
     rotation : (F, 3, 3) world ENU -> camera optical
     position : (F, 3) m ENU
@@ -102,8 +100,6 @@ _GIMBAL_EARTH = _GIMBAL_FLAGS | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.G
 class SimulatedVehicle:
     """MAVLink vehicle on a link of its own.
 
-    Parameters
-    ----------
     link : a transport, or a URL of :func:`drocap_ros.flight.mavlink.transport.open_transport`
     path : None = the subclass overrides :meth:`at`
     autopilot : name of one that has a simulated counterpart
