@@ -14,7 +14,7 @@ import numpy as np
 
 from drocap_ros.errors import DrocapError, InputError, first_line
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.perception.persons import FoundPerson
+from drocap_ros.perception.people import FoundPerson
 from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.sources.video import pyav
 from drocap_ros.skeleton import side_of

@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
 
 from drocap_ros.background import FixedPoints
-from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
+from drocap_ros.flight.vehicle import VehicleState as VehicleStateData
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState

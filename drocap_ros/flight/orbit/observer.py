@@ -19,8 +19,7 @@ from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
-from drocap_ros.flight.vehicle_filter import Doubt, PoseHistory, VehicleFilter
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import Doubt, PoseHistory, VehicleFilter, VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.stamps import NS

@@ -27,7 +27,7 @@ from drocap_ros.flight.preflight.findings import LASTING, Finding, Measured, Str
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
 from drocap_ros.flight.preflight.vehicle_checks import vehicle_findings
-from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, VehicleState
+from drocap_ros.flight.vehicle import LANDED_IN_AIR, VehicleState
 from drocap_ros.stamps import NS
 
 _CONDITIONS_PERIOD_S = 0.1  # between looks at the conditions for motion: two steps of the loop

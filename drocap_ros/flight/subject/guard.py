@@ -21,7 +21,7 @@ from drocap_ros.flight.subject.subject_measurement import (
     SubjectMeasurement,
     locate_subject,
 )
-from drocap_ros.flight.vehicle_filter import CameraPose
+from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.stamps import NS
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.bridge_config import SubjectConfig
-from drocap_ros.flight.vehicle_filter import CameraPose
+from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.skeleton import BODY_15, joint_map
 

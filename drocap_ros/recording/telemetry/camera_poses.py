@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.vehicle_state import camera_rotation, quaternion_from_euler
+from drocap_ros.flight.vehicle import camera_rotation, quaternion_from_euler
 from drocap_ros.geometry.interpolation import interpolate, true_runs, without_steps
 from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import VehicleTrack

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.vehicle_state import camera_rotation
+from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.recording.telemetry.camera_poses import camera_attitude
 from drocap_ros.recording.telemetry.log import TelemetryLog, VehicleTrack

@@ -21,7 +21,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import AUTOPILOTS, autopilot_of
 from drocap_ros.flight.mavlink.parser import CurrentMode, MavlinkParser, sign_with
 from drocap_ros.flight.mavlink.transport import Transport, open_transport
-from drocap_ros.flight.vehicle_state import OPTICAL_FROM_FLU, enu_to_ned, flu_to_frd, orientation_to_aviation
+from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, enu_to_ned, flu_to_frd, orientation_to_aviation
 from drocap_ros.geometry.geodesy import enu_to_geodetic
 from drocap_ros.geometry.rotations import quaternion_from_matrix, slerp
 from drocap_ros.simulation.orbit_camera import orbit_camera
