@@ -17,10 +17,10 @@ from typing import Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from drocap_ros.errors import NodeError
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.sources.pixels import decoded
+from drocap_ros.perception.sources.image_files import decoded
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.common.engine import blas_threads
 
@@ -138,10 +138,7 @@ class OwnProcess(Generic[_P, _R]):
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         """The result of a call, or its error; one thread calls at a time.
 
-        Raises
-        ------
-        NodeError
-            When the process has died.
+        Raises NodeError when the process has died.
         """
         result: _R
         try:
