@@ -33,11 +33,7 @@ BUDGETS = {
     # evidence, lens, shoulders, a camera (0.05); numbers of persons in a part (0.02);
     # inputs of several recordings (0.05); everybody in the pictures (0.25); single quaternions by Python's numbers,
     # which takes an eighth from every simulated flight (0.05)
-    ("perception",): 7.45,  # 2.25 over the plan: tracking keeps its own association; foreign pictures and streams came;
-    # points of the scene (0.35); networks of TensorFlow Lite, which registries hold, become ONNX (0.43); files of
-    # wheels, which came from `cli` (0.07), feet and joints in space by a second network (0.13); steps of an image
-    # beside each other (0.10); everybody in one pass: bodies from image to image, whose each joint is (0.75);
-    # points of an hour (0.02); persons beside a live subject, each in a place (0.29)
+    ("perception",): 6.65,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 13.69,  # 4.22 over the plan: world/ and live/ kept their steps; one constant a line;
     # with reasons; camera/, paths by fixed points of the scene (1.25), without telemetry, with up and metres (1.20);
     # the view of a camera that looks at the person, assumed lenses, evidence of depth (0.32), in live windows (0.05);
@@ -52,10 +48,7 @@ BUDGETS = {
     # (0.06), and the person goes on from a path to the next one (0.05);
     # lean by balance (0.13)
     ("flight",): 9.35,  # a process that holds after the bridge's death; conditions with their values; preflight
-    ("recording",): 5.70,  # 1.16 over the plan: every format of telemetry stayed; keypoints of other tools came (0.38)
-    # and 3D poses of theirs (0.11); subtitles beside a video, units of flight logs (0.04);
-    # bags without an index (0.12); points as the live graph had them (0.04);
-    # topics of persons beside the subject (0.01)
+    ("recording",): 5.25,  # every format of telemetry and of keypoints stayed; damaged and foreign recordings
     ("simulation",): 3.55,  # reports err as recorded ones
     ("evaluation",): 1.0,  # truth from C3D, TRC and BVH by the names of other programs (0.34)
     ("export", "report", "view"): 4.40,  # exports for OpenSim, a report of several persons, the video beside the body

@@ -83,8 +83,8 @@ def test_the_knees_of_outdoor_walk_bend_as_the_legs_shorten_in_the_image(outdoor
 
 def test_squats_agree_with_another_system(shared, tmp_path, monkeypatch):
     opened: list[VideoSource] = []
-    begin = VideoSource._opened
-    monkeypatch.setattr(VideoSource, "_opened", lambda source: opened.append(source) or begin(source))
+    begin = VideoSource._begin
+    monkeypatch.setattr(VideoSource, "_begin", lambda source: opened.append(source) or begin(source))
     motion = reconstructed(shared / "media" / "pose_squats.mp4", tmp_path, "--models", shared / "models")
     assert np.isfinite(motion.keypoints).all(axis=2).any(axis=1).mean() >= 0.95
     # The report shows the pictures of the video, which was decoded once.
