@@ -12,7 +12,7 @@ import numpy as np
 from figures import ROOT, table, write_figures
 
 from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.flight.vehicle_filter import VehicleFilter
+from drocap_ros.flight.vehicle import VehicleFilter
 from lab.flights.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
 
 HEAD = ["recording", "autopilot", "from, s", "off after 1, 2, 3 s, m", "most, m", "went, simulated, m", "recorded, m"]

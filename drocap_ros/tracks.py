@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import zipfile
 import zlib
 from collections.abc import Collection
@@ -13,12 +14,15 @@ import numpy as np
 
 from drocap_ros.background import Background, read_background
 from drocap_ros.errors import InputError, first_line
+from drocap_ros.geometry.pinhole import MOST_ASPECT, pixels_are_usual
 from drocap_ros.stamps import as_stamps, check_stamps
 
 #: Longest accepted sequence (10 h at 30 fps); longer ones are refused before memory runs out.
 MAX_FRAMES = 1_080_000
 #: Upper bound on the arrays of such a sequence, optional ones included.
 MAX_BYTES = 4 * 2**30
+#: Arrays of a file: its kinds have some twenty.
+_MOST_ARRAYS = 1000
 #: Keypoints beyond it are no pixels, and their squares overflow in the solvers.
 _FARTHEST_PX = 1e9
 #: Keypoints that are all within it are shares of the image, not px.
@@ -171,6 +175,11 @@ def check_camera_matrix(matrix: np.ndarray, size: tuple[int, int]) -> None:
                 f"camera_matrix: expected focal lengths in px, between {low:g} and {high:g} for an image {axis} of"
                 f" {length}, got {matrix[i, i]:g}; multiply normalised ones by the image size"
             )
+    if not pixels_are_usual(matrix):
+        raise InputError(
+            f"camera_matrix: expected focal lengths of which one is at most {MOST_ASPECT:g} times the other, got"
+            f" {matrix[0, 0]:g} and {matrix[1, 1]:g}; correct it"
+        )
 
 
 _REQUIRED = ("keypoints", "joints", "stamp_ns", "image_size")
@@ -216,14 +225,30 @@ def _load(path: Path) -> dict[str, np.ndarray]:
     _check_kind(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
-            size = sum(entry.file_size for entry in archive.zip.infolist())
+            entries = archive.zip.infolist()
+            size = sum(entry.file_size for entry in entries)
             if size > MAX_BYTES:
                 raise InputError(f"{path}: expected at most {MAX_BYTES} bytes of arrays, got {size}; cut the recording")
+            if len(entries) > _MOST_ARRAYS:
+                raise InputError(f"{path}: expected at most {_MOST_ARRAYS} arrays, got {len(entries)}; check the path")
+            for entry in entries:
+                _check_declared(archive.zip, entry)
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError) as error:
         raise InputError(f"{path}: expected a readable .npz archive; {_reason(error)}") from None
+
+
+def _check_declared(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
+    """Refuse an array whose head declares more values than its entry holds: they would take memory first."""
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)  # type: ignore[no-untyped-call]  # NumPy has no types here
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)  # type: ignore[no-untyped-call]  # NumPy has no types here
+    if math.prod(shape) * dtype.itemsize > entry.file_size:
+        name, has = entry.filename.removesuffix(".npy"), entry.file_size
+        raise ValueError(f"array {name} declares {math.prod(shape)} values and has {has} bytes; write it again")
 
 
 def _check_kind(path: Path) -> None:

@@ -48,7 +48,7 @@ BUDGETS = {
     # (0.06), and the person goes on from a path to the next one (0.05);
     # lean by balance (0.13)
     ("flight",): 9.35,  # a process that holds after the bridge's death; conditions with their values; preflight
-    ("recording",): 5.25,  # every format of telemetry and of keypoints stayed; damaged and foreign recordings
+    ("recording",): 5.30,  # every format of telemetry and of keypoints stayed; damaged and foreign recordings
     ("simulation",): 3.55,  # reports err as recorded ones
     ("evaluation",): 1.0,  # truth from C3D, TRC and BVH by the names of other programs (0.34)
     ("export", "report", "view"): 4.40,  # exports for OpenSim, a report of several persons, the video beside the body

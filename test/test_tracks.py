@@ -1,3 +1,6 @@
+import io
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -69,6 +72,9 @@ def test_file_round_trip(tmp_path):
         ({"camera_matrix": lens(0.7)}, "focal lengths in px, between 64 and 64000 for an image width of 640, got 0.7"),
         ({"camera_matrix": lens(500.0, 0.7)}, "for an image height of 480, got 0.7"),
         ({"camera_matrix": lens(500.0).T}, "the last row 0 0 1"),
+        ({"camera_matrix": np.diag([500.0, 500.0, 2.0])}, "the last row 0 0 1"),
+        ({"camera_matrix": lens(1e-9)}, "focal lengths in px"),
+        ({"camera_matrix": lens(6000.0, 60.0)}, "at most 4 times the other, got 6000 and 60"),
         ({"keypoints": np.full((4, 15, 2), 1e154)}, r"at most 1e\+09 px, got 1e\+154"),
         ({"covariance": np.full((4, 15, 3), 1e300)}, r"covariance: expected at most 1e\+18 px\^2"),
         ({"stamp_ns": np.arange(4, dtype=np.uint64) + np.uint64(2**63)}, "expected int64"),
@@ -109,3 +115,18 @@ def test_invalid_files_are_refused(tmp_path):
     for name in ("text", "cut", "single", "other", "object", "none"):
         with pytest.raises(InputError, match=name):
             load_tracks(tmp_path / f"{name}.npz")
+
+
+def test_file_that_declares_more_than_it_holds_is_refused_at_once(tmp_path):
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    many = tmp_path / "many.npz"
+    for path, entries in (
+        (tmp_path / "large.npz", {"keypoints.npy": head.getvalue() + bytes(80)}),
+        (many, {f"a{n}.npy": head.getvalue() for n in range(1001)}),
+    ):
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in entries.items():
+                archive.writestr(name, data)
+        with pytest.raises(InputError, match=r"declares 1000000000000 values|at most 1000 arrays"):
+            load_tracks(path)

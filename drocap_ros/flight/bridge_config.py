@@ -146,7 +146,7 @@ class SubjectConfig(Parameters):
     )
 
 
-_ROOM_M = 0.5  # of an orbit from min_distance_m: the error of the flown radius
+FLIGHT_ERROR_M = 0.5  # of the flown radius: an orbit's room from min_distance_m, and the most that is trimmed
 LEAST_REVERSAL_S = 10.0  # a turn takes two ramps
 
 
@@ -208,7 +208,7 @@ class OrbitConfig(Parameters):
 
 def orbit_condition(config: OrbitConfig, radius_m: float, angular_speed_deg_s: float) -> Condition | None:
     """Which limit of ``config`` forbids this orbit; None = none."""
-    least = config.min_distance_m + _ROOM_M
+    least = config.min_distance_m + FLIGHT_ERROR_M
     if radius_m * ROUNDING < least:
         return condition(ConditionCode.RADIUS_TOO_SMALL, value=radius_m, limit=least)
     if radius_m > config.max_distance_m * ROUNDING:

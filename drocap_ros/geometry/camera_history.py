@@ -8,6 +8,7 @@ import numpy as np
 
 from drocap_ros.camera_path import CameraPath, Teller
 from drocap_ros.geometry.interpolation import MAX_GAP_S, interpolate
+from drocap_ros.geometry.pinhole import pixels_are_usual
 from drocap_ros.geometry.rotations import matrix_from_quaternion, unit_quaternions
 
 #: Poses kept: the longest window at 100 Hz.
@@ -60,9 +61,8 @@ class CameraHistory:
 
         size : width and height px of the images that it is for; 0 = not stated
         """
-        if not (
-            np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) >= 1 and np.allclose(matrix[2], (0, 0, 1))
-        ):
+        whole = np.isfinite(matrix).all() and np.allclose(matrix[2], (0, 0, 1))
+        if not whole or min(matrix[0, 0], matrix[1, 1]) < 1 or not pixels_are_usual(matrix):
             return
         last = self._matrices[-1] if self._matrices else None
         if last is None or last[2] != size or not np.array_equal(last[1], matrix):

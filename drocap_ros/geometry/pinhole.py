@@ -9,6 +9,15 @@ from drocap_ros.geometry.rotations import exp_so3
 #: Focal length of a lens of which nothing is known, share of the image's longer side: ``assumed_focal`` says why.
 ASSUMED_FOCAL = 0.85
 
+#: Ratio of the focal lengths up to which a matrix is one of a lens: anamorphic ones squeeze by two.
+MOST_ASPECT = 4.0
+
+
+def pixels_are_usual(matrix: np.ndarray) -> bool:
+    """Whether the focal lengths of a matrix (3, 3) belong to one lens."""
+    fx, fy = np.diagonal(matrix)[:2].tolist()
+    return bool(0.0 < max(fx, fy) <= MOST_ASPECT * min(fx, fy))
+
 
 def centred_camera(size: tuple[int, int], focal_px: float) -> np.ndarray:
     """Camera matrix (3, 3) px of images of ``size`` (width, height); pixel 0 has its centre at 0, as in OpenCV."""

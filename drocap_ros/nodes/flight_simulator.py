@@ -24,8 +24,7 @@ from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_r
 from drocap_ros.ros.diagnostics import PILOT_FLIES, PILOT_HANDS_OFF, Key
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.lockstep import STEP_S
-from drocap_ros.ros.look_ahead import LooksAhead
-from drocap_ros.ros.own_process import OwnProcess
+from drocap_ros.ros.own_process import LooksAhead, OwnProcess
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import save_flight_truth
 from drocap_ros.simulation.flight_simulator.world import Exposure, FlightWorld

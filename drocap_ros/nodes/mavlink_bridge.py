@@ -25,12 +25,11 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.guardian import GuardianProcess
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.telemetry_request import LinkStatus
-from drocap_ros.flight.orbit.control_status import ControlStatus
-from drocap_ros.flight.orbit.controller import OrbitController
+from drocap_ros.flight.orbit.command_checks import Rivals
+from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
 from drocap_ros.flight.orbit.states import Command, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
-from drocap_ros.flight.rivals import Rivals
-from drocap_ros.flight.vehicle_state import VehicleState, optical_orientation
+from drocap_ros.flight.vehicle import VehicleState, optical_orientation
 from drocap_ros.msg import OrbitStatus, Pose2D
 from drocap_ros.parameters import Values
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode, MessageInfo

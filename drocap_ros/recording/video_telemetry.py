@@ -22,7 +22,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.file_kind import FileKind, file_kind
-from drocap_ros.flight.vehicle_state import camera_rotation
+from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.perception.calibration import camera_model

@@ -60,8 +60,6 @@ class ComponentNode(Node):
     names the nodes of a graph that a bringup starts: the node is ready as soon as its publishers and subscriptions are
     matched with theirs, without the parameter at once.
 
-    Parameters
-    ----------
     config : the component's parameters; ROS parameter overrides take precedence
     transport : a simulated link in this process, instead of that of the configuration
     node_kwargs : passed on to :class:`rclpy.node.Node` (context, namespace, parameter_overrides, ...)

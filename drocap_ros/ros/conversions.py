@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
 
 from drocap_ros.background import FixedPoints
-from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
+from drocap_ros.flight.vehicle import VehicleState as VehicleStateData
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.observation import PoseObservation

@@ -41,8 +41,6 @@ class Lockstep:
     equal.  The middleware carries the messages too, and ``/clock``, as soon as a viewer subscribes; before that only
     those that it keeps for late subscribers: a message took 0.5 ms of this thread and more of its own (measured).
 
-    Parameters
-    ----------
     components : with parameter ``use_sim_time``, in the order in which they act
     observer : node of the script, also with ``use_sim_time``; it comes last
     """

@@ -68,8 +68,6 @@ def simulate_capture(
 ) -> SimulatedCapture:
     """Simulate a capture flight.
 
-    Parameters
-    ----------
     seconds, fps : length and image rate; at least one frame
     seed : person, take and noise
     start_ns : stamp of the first image

@@ -48,8 +48,6 @@ def detect_person(
 ) -> NoisyKeypoints:
     """Keypoints of joints (F, P, 3) m ENU in a camera, with self-occlusion; NaN outside the image.
 
-    Parameters
-    ----------
     rotation, position : (F, 3, 3) world -> camera, (F, 3) m ENU
     errors : keywords of :func:`noisy_keypoints`
     """
@@ -97,8 +95,6 @@ def noisy_keypoints(
     correlated over time; outliers and misses are three times as frequent among occluded joints.  The reported
     covariance is right on average, not per keypoint; most outliers have a lower confidence.
 
-    Parameters
-    ----------
     px : (F, P, 2) exact projections, NaN outside the image
     occluded : (F, P) bool, see :func:`occlusion`
     """

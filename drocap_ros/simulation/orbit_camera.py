@@ -28,8 +28,6 @@ def orbit_camera(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pose of a camera that circles a moving centre and points at it.
 
-    Parameters
-    ----------
     t : (F,) s
     centre : (F, 3) m ENU
     radius_m, height_m : horizontal distance from the centre; height above the ground (z = 0)

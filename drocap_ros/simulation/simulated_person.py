@@ -32,8 +32,6 @@ def add_toes(joints: np.ndarray, heading: np.ndarray, stature_m: float) -> np.nd
     The bone from ankle to toe has one length.  Near the ground the toe keeps its height, however high the ankle is;
     the foot of a lifted leg is perpendicular to the shank.
 
-    Parameters
-    ----------
     joints : (F, 15, 3) m, z up, the ground at z = 0
     heading : (F, 2) rad, of the right and the left foot, about the vertical
     """
@@ -122,8 +120,6 @@ def simulate_person(
 ) -> np.ndarray:
     """Joints of a moving person.
 
-    Parameters
-    ----------
     t : (F,) s, at least 0, in any order; the pose at an instant does not depend on the other instants
     action : one of ``ACTIONS``
     seed : of the person's proportions and of the take

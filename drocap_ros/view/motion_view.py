@@ -33,8 +33,6 @@ def place_cameras(
 
     Scaled orthographic projection, so exact only for a far camera; NaN where fewer than two joints are seen.
 
-    Parameters
-    ----------
     joints : (F, P, 3) m in the world, NaN unknown
     keypoints : (F, P, 2) px, NaN not seen
     rotation : (F, 3, 3) world -> optical

@@ -67,8 +67,6 @@ def to_browser(
     Gives the page's address.  The server is Rerun's program, not its library: the library serves the images of a
     person to the whole network.
 
-    Parameters
-    ----------
     host : address to serve on; 127.0.0.1 = this machine alone
     """
     _check_free(host, port, port + 1)

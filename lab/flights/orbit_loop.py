@@ -20,11 +20,10 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.mavlink.guardian import Guardian
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.orbit.control_status import ControlStatus
-from drocap_ros.flight.orbit.controller import OrbitController
+from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
 from drocap_ros.flight.orbit.states import Action, Command, CommandAnswer, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
-from drocap_ros.flight.vehicle_state import camera_rotation
+from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.simulation.vehicle.dynamics import Body
+from drocap_ros.simulation.vehicle.copter_reports import Body
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target, control_of
 
 STEP_S = 0.01

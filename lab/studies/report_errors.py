@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.simulated import ReportErrors
-from drocap_ros.simulation.vehicle.dynamics import EstimateError
+from drocap_ros.flight.autopilot.autopilot import ReportErrors
+from drocap_ros.simulation.vehicle.copter_reports import EstimateError
 
 STEP_S = 0.1
 #: Flights with a cut link have few reports, those without satellites other errors.

@@ -30,7 +30,7 @@ from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.measure import all_findings
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
-from drocap_ros.flight.vehicle_state import LANDED_ON_GROUND, VehicleState
+from drocap_ros.flight.vehicle import LANDED_ON_GROUND, VehicleState
 from drocap_ros.perception.sources import Frame, ImageSource
 from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.ros.diagnostics import Key

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.vehicle_state import enu_to_ned
+from drocap_ros.flight.vehicle import enu_to_ned
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from drocap_ros.flight.vehicle_state import orientation_to_aviation
+from drocap_ros.flight.vehicle import orientation_to_aviation
 from drocap_ros.recording.telemetry.log import TelemetryLog, VehicleTrack
 
 

@@ -11,7 +11,7 @@ from telemetry_stream import orbit
 from drocap_ros.background import FixedPoints
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
-from drocap_ros.flight.vehicle_state import OPTICAL_FROM_FLU, VehicleState
+from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.observation import PoseObservation

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose3D
 from drocap_ros.observation import PoseObservation

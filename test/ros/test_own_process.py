@@ -1,17 +1,117 @@
-"""A function in a process of its own."""
-
-from __future__ import annotations
+"""Observations of pictures that are still to be published."""
 
 import logging
 import os
 import signal
+from concurrent.futures import Future
 
+import cv2
 import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError, NodeError
-from drocap_ros.ros.own_process import OwnProcess
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.load_models import models_folder
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.ros.own_process import LoadShedding, LookAhead, OwnProcess
+from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix
 from drocap_ros.simulation.render.renderer import Renderer
+from drocap_ros.simulation.simulated_person import simulate_person
+
+STEP_NS = 66_666_667  # of a camera with 15 images a second
+
+
+@pytest.fixture(scope="module")
+def jpegs():
+    t = 1.3 + np.arange(6) * STEP_NS * 1e-9
+    joints = simulate_person(t, "mixed", 0)
+    rotation, position = orbit_camera(t, joints[:, 0], 6.0, 2.5, 25.0, 0.0)
+    renderer = Renderer(pinhole_matrix(640, 360, 60), 640, 360, 0)
+    return [renderer.jpeg(90, *view) for view in zip(joints, rotation, position, strict=True)]
+
+
+@pytest.fixture
+def ahead():
+    process = LookAhead(PoseEstimatorConfig(models_dir="simulation", provider="cpu"))
+    yield process
+    process.close()
+
+
+def rendered(jpeg):
+    """The future of a picture that is there."""
+    future = Future()
+    future.set_result(jpeg)
+    return future
+
+
+def test_observations_are_those_of_an_estimator_of_this_process(jpegs, ahead):
+    config = PoseEstimatorConfig(models_dir="simulation", provider="cpu")
+    estimator, box = PoseEstimator(models_folder("simulation"), config), np.array([200.0, 60, 440, 330])
+    for i, jpeg in enumerate(jpegs):
+        ahead.begin(i * STEP_NS, rendered(jpeg), box if i == 2 else None)
+    seen = 0
+    for i, jpeg in enumerate(jpegs):
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        here, there = estimator.process(image, i * STEP_NS, box if i == 2 else None), ahead.take(i * STEP_NS)
+        np.testing.assert_array_equal(here.keypoints, there.keypoints)
+        np.testing.assert_array_equal(here.roi, there.roi)
+        np.testing.assert_array_equal(here.background.point, there.background.point)
+        seen += there.has_subject
+    assert seen > len(jpegs) / 2
+
+
+def test_pictures_that_were_never_published_are_forgotten(jpegs, ahead):
+    for stamp_ns in (10, 20, 30):
+        ahead.begin(stamp_ns, rendered(jpegs[0]), None)
+    assert ahead.take(5) is None  # exposed before the first that was begun
+    assert ahead.take(20).stamp_ns == 20
+    assert not ahead.knows(20)
+    assert ahead.knows(30)
+
+
+def test_a_picture_that_does_not_decode_is_an_error_of_its_own(jpegs, ahead):
+    ahead.begin(10, rendered(b"no picture"), None)
+    ahead.begin(20, rendered(jpegs[0]), None)
+    with pytest.raises(InputError, match="expected JPEG"):
+        ahead.take(10)
+    assert ahead.take(20).stamp_ns == 20
+
+
+def levels(shedding, queued, step_s=1 / 30, backlog=0):
+    return [shedding.level(i * step_s, waited, backlog) for i, waited in enumerate(queued)]
+
+
+def test_level_is_zero_while_no_image_queues():
+    assert levels(LoadShedding(3), [False] * 100) == [0] * 100
+
+
+def test_level_rises_in_steps_to_the_maximum_while_images_queue():
+    seen = levels(LoadShedding(3), [True] * 60)
+    assert seen[0] == 1
+    assert sorted(seen) == seen
+    assert seen[-1] == 3
+    assert seen.count(1) >= 5  # each level has time to take effect
+
+
+def test_level_falls_by_one_per_second_without_queued_images():
+    shedding = LoadShedding(3)
+    levels(shedding, [True] * 60)
+    seen = [shedding.level(2.0 + i / 30, False, 0) for i in range(120)]
+    assert [seen[i] for i in (0, 40, 70, 110)] == [3, 2, 1, 0]
+
+
+def test_one_late_image_in_two_seconds_raises_the_level_by_one_only():
+    assert set(levels(LoadShedding(3), ([True] + [False] * 59) * 5)) == {0, 1}
+
+
+def test_backlog_raises_the_level_at_once():
+    shedding = LoadShedding(3)
+    assert [shedding.level(0.0, True, 1), shedding.level(0.01, True, 4), shedding.level(0.02, True, 0)] == [2, 3, 1]
+
+
+@pytest.mark.parametrize("backlog", [0, 3])
+def test_maximum_of_zero_disables_shedding(backlog):
+    assert set(levels(LoadShedding(0), [True] * 60, backlog=backlog)) == {0}
 
 
 class Sum:

@@ -6,7 +6,6 @@ import stat
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -18,12 +17,10 @@ from sensor_msgs.msg import Image
 
 from drocap_ros.bringup import bringup, free_domain, lockstep, node_class
 from drocap_ros.config import DrocapConfig, section_types
-from drocap_ros.errors import InputError, NodeError
-from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow
+from drocap_ros.errors import InputError
+from drocap_ros.msg import Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.topics import NODES, TOPICS
-from drocap_ros.simulation.vehicle.loopback import free_udp_port
-from drocap_ros.srv import OrbitCommand
 
 CAPTURE = ["session_player", "initializer", "bundle_adjuster"]
 
@@ -67,18 +64,6 @@ def test_nothing_is_lost_at_the_start_and_every_keypoint_becomes_a_pose(processe
     assert stages[-1] == Pose3D.REFINED
 
 
-def test_two_graphs_side_by_side_receive_their_own_messages_only(tmp_path):
-    with ExitStack() as stack:
-        graphs = [stack.enter_context(bringup(short_flight(tmp_path, 2.0, seed), CAPTURE[:2])) for seed in (0, 1)]
-        assert graphs[0].domain_id != graphs[1].domain_id
-        got = [collect(graph, "pose2d") for graph in graphs]
-        for graph in graphs:
-            graph.wait_finished("session_player", timeout_s=60)
-    first, second = (np.array([m.keypoints for m in g["pose2d"]]) for g in got)
-    assert len(first) == len(second) == 30
-    assert not np.array_equal(first, second)
-
-
 def test_free_domain_is_given_once():
     with free_domain() as first, free_domain() as second:
         assert first != second
@@ -91,33 +76,9 @@ def test_refusal_of_a_node_is_raised_by_the_bringup(processes, tmp_path):
         pytest.fail("the graph came up without its source")
 
 
-def kill_a_node_in_flight(folder):
-    with bringup(short_flight(folder, 20.0), CAPTURE[:2], processes=True) as graph:
-        os.kill(graph.pid("initializer"), 9)
-        graph.wait_until(lambda: False, 20)
-
-
-def test_killed_process_ends_the_graph_and_the_others_stop(tmp_path):
-    with pytest.raises(NodeError, match="initializer ended with status -9"):
-        kill_a_node_in_flight(tmp_path)
-
-
 def test_unknown_node_is_refused():
     with pytest.raises(InputError, match="expected some of"), bringup(DrocapConfig(), ["pose_estimater"]):
         pass
-
-
-def test_bridge_without_permission_refuses_to_start_an_orbit():
-    config = DrocapConfig().replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
-    with bringup(config, ["mavlink_bridge"]) as graph:
-        got = collect(graph, "orbit/status")
-        client = graph.node.create_client(OrbitCommand, "orbit/command")
-        graph.wait_until(client.service_is_ready, 20, "the bridge's service")
-        answer = client.call_async(OrbitCommand.Request(command=OrbitCommand.Request.START))
-        graph.wait_until(answer.done, 20, "an answer")
-        assert not answer.result().accepted
-        graph.wait_until(lambda: got["orbit/status"], 20, "a status")
-    assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
 
 
 def test_priority_of_a_process_follows_the_table_in_the_session_and_out_of_the_group_of_the_command(tmp_path):

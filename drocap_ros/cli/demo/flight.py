@@ -134,8 +134,6 @@ class _Answer(Protocol):
 class _Desk:
     """Connects the operator with the graph: status and diagnostics in, commands out.
 
-    Parameters
-    ----------
     graph : its node is in the namespace of the nodes
     call : sends a request to the bridge; returns the future of its answer
     now_s : the operator's clock

@@ -46,8 +46,6 @@ class _Status(NamedTuple):
 class Operator:
     """Starts the orbit when the bridge is ready, starts it again after a hold, and stops it at the end.
 
-    Parameters
-    ----------
     seconds : wanted time of orbit, without holds
     restarts : greatest number of starts after holds
     requests_control : whether already the first start must request control from the autopilot (PX4), as every start

@@ -18,7 +18,7 @@ from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.flight.preflight.findings import Measured, Stream
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.recording.session import Message
 from drocap_ros.ros.diagnostics import Key, number, of, values_of
 
@@ -40,6 +40,7 @@ _STATE_FIELDS = (
 )
 
 
+_CODES = {code.value: code for code in ConditionCode}
 #: Without those of place and subject, which follow a take-off.
 _OF_VEHICLE = range(ConditionCode.COMMANDS_DISABLED, ConditionCode.TOO_FAST)
 
@@ -87,7 +88,7 @@ class BridgeListener:
         idle = {status.condition: status.reason for status in self.statuses if status.state == State.IDLE}
         times = Counter(status.condition for status in self.statuses)
         return tuple(
-            (_Reported(ConditionCode(code), words=reason), times[code] / len(self.statuses))
+            (_Reported(_CODES[code], words=reason), times[code] / len(self.statuses))
             for code, reason in sorted(idle.items())
             if code in _OF_VEHICLE
         )

@@ -5,19 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drocap_ros.flight.autopilot.autopilot import (
+    Airframe,
     Autopilot,
     CoastLimits,
+    Decay,
     Echo,
     Fence,
     FenceSettings,
     FlownSpeeds,
+    Gains,
     Hints,
     Level,
+    ReportErrors,
     SettingCheck,
+    Simulated,
     warn_if,
 )
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
-from drocap_ros.flight.autopilot.simulated import Airframe, Decay, Gains, ReportErrors, Simulated
 
 _GOES_ON = "on the autopilot: else the orbit goes on when the remote control is lost, and nobody takes over by it"
 _SLOW_STOP = "on the autopilot, as shipped since 4.1: with less each stop is longer, that after the bridge's death too"

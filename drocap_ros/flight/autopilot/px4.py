@@ -6,20 +6,25 @@ import math
 from collections.abc import Callable
 
 from drocap_ros.flight.autopilot.autopilot import (
+    Airframe,
     Autopilot,
     CoastLimits,
+    Decay,
     Echo,
     Fence,
     FenceSettings,
     FlownSpeeds,
+    Gains,
     Hints,
     Level,
     LossAction,
+    ReportErrors,
     SettingCheck,
+    Simulated,
+    StickOverride,
     warn_if,
 )
 from drocap_ros.flight.autopilot.coasting import HeldCoasting
-from drocap_ros.flight.autopilot.simulated import Airframe, Decay, Gains, ReportErrors, Simulated, StickOverride
 
 #: Values of GF_ACTION that guard nobody: its 4 is flight termination, above a person.
 _IDLE_FENCES = {0.0: "off", 1.0: "warns only", 4.0: "stops the motors"}

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import AUTOPILOTS
 from drocap_ros.flight.autopilot.coasting import Setpoint
-from drocap_ros.flight.vehicle_state import enu_to_ned
+from drocap_ros.flight.vehicle import enu_to_ned
 
 
 class Message(Protocol):

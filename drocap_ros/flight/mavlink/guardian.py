@@ -46,8 +46,6 @@ logger = logging.getLogger(__name__)
 class Guardian:
     """What was handed over last, and when it is sent.  It reads no clock.
 
-    Parameters
-    ----------
     limit_s : silence of the bridge
     """
 
@@ -80,8 +78,6 @@ class Guardian:
 class GuardianProcess:
     """The guardian's process, seen from the bridge.
 
-    Parameters
-    ----------
     limit_s : silence of the bridge, after which it acts
     """
 

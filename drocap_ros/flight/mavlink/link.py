@@ -20,12 +20,12 @@ from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.commands import TELEMETRY_COMMANDS, Message, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.guardian import PACKETS
-from drocap_ros.flight.mavlink.mount import Mount
 from drocap_ros.flight.mavlink.parser import MavlinkParser, Packer, read_signing_key
+from drocap_ros.flight.mavlink.reports import Mount
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.mavlink.telemetry_request import AutopilotSettings, LinkStatus, TelemetryRequests
 from drocap_ros.flight.mavlink.transport import LinkError, Transport, open_transport
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.stamps import NS
 
 _RECONNECT_S = 1.0  # between tries to open a broken link again
@@ -39,8 +39,6 @@ logger = logging.getLogger(__name__)
 class MavlinkLink:
     """Link to one autopilot.  Use as a context manager, and either call :meth:`spin_once` or :meth:`run`.
 
-    Parameters
-    ----------
     config : where to connect, what to request
     clock_ns : our clock, ns; that of the stamps
     monotonic_s : clock of the periods and of silence
@@ -250,13 +248,14 @@ class MavlinkLink:
         if message.get_srcSystem() != self.estimator.system_id or self.estimator.component_id == 0:
             return state
         self._heard_s = self._monotonic_s()
-        self._transport.accept_peer()
         kind = self.estimator.modes.autopilot
         if kind is not None and kind is not self._autopilot:
             self._adopt(kind)
         self._requests.count(message.get_msgId(), now_ns)
-        # A gimbal, a camera or another companion of this vehicle answers for itself alone.
+        # A gimbal, a camera or another companion of this vehicle answers for itself alone, and may have its own port.
         if message.get_srcComponent() == self.estimator.component_id:
+            if name == "HEARTBEAT":
+                self._transport.accept_peer()
             self._take_answer(name, message, now_ns)
         return state
 

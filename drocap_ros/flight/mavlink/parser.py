@@ -22,8 +22,6 @@ class CurrentMode(mavlink.MAVLink_message):
     and after every change: a mode of the pilot is seen after one interval, not after the second between two heartbeats.
     Source: MAVLink's common.xml, https://mavlink.io/en/messages/common.html#CURRENT_MODE.
 
-    Parameters
-    ----------
     standard_mode : MAV_STANDARD_MODE, 0 = none of them
     custom_mode : as in HEARTBEAT
     intended_custom_mode : the mode that was chosen last, and that the vehicle may enter as soon as it can; 0 = unknown
@@ -91,8 +89,6 @@ class Packer:
 
     Signed packets of one stream must not go back in time, so whoever shares no lock with the others has its own.
 
-    Parameters
-    ----------
     system, component : our ids
     key : of 32 bytes
     now_ns : our clock
@@ -138,8 +134,6 @@ class MavlinkParser:
     Pymavlink's largest dialect holds the common one of its time.  Messages that it does not have are no damage: a
     healthy autopilot sends two a second.
 
-    Parameters
-    ----------
     key : 32 bytes; then messages without its signature count as bad
     now_ns : our clock at the beginning; a stream that is a minute behind it is a replayed recording
 

@@ -89,7 +89,7 @@ class AutopilotSettings:
 
 
 _FAST_HEARTBEAT_HZ = 5.0  # where it may be requested: a pilot's mode is seen within 0.2 s
-_CURRENT_MODE_HZ = 2.0  # while nothing changes: measured
+CURRENT_MODE_HZ = 2.0  # while nothing changes: measured
 _CURRENT_MODE_INTERVAL_HZ = 20.0  # asked for: a change comes after one interval
 _ECHO_HZ = 10.0  # two echoes within the time after which a mismatch counts
 _GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
@@ -181,7 +181,7 @@ class TelemetryRequests:
             self._wanted.setdefault(number, _Wanted(self._config.status_hz))
         fixed = not autopilot.heartbeat_on_request
         if fixed and self._wanted.pop(mavlink.MAVLINK_MSG_ID_HEARTBEAT, None) is not None:
-            self._wanted[CurrentMode.id] = _Wanted(_CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ)
+            self._wanted[CurrentMode.id] = _Wanted(CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ)
 
     def count(self, message_id: int, now_ns: int) -> None:
         """Count a message."""

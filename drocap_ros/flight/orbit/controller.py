@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import threading
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,12 +27,12 @@ from drocap_ros.flight.mavlink.commands import (
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.command_checks import CommandDesk
-from drocap_ros.flight.orbit.control_status import ControlStatus
 from drocap_ros.flight.orbit.observer import Observer, OwnFlight
 from drocap_ros.flight.orbit.safety import permit_mode, reduce, way_out
 from drocap_ros.flight.orbit.setpoint import FlownOrbit
 from drocap_ros.flight.orbit.states import (
     Action,
+    CommandAnswer,
     Fault,
     Holding,
     Idle,
@@ -44,8 +45,39 @@ from drocap_ros.flight.orbit.states import (
     State,
 )
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.observation import PoseObservation
+
+
+class ControlStatus(NamedTuple):
+    """Outcome of one step: the fields of ``msg/OrbitStatus.msg``, the commands it answered, and what was sent.
+
+    failed : why the last engage ended without an orbit; None = it did not, or another command has followed
+    mode_failure : why the autopilot did not enter the requested mode, as a sentence; "" = it did, or none was requested
+    way_out : what the operator may do next, as a sentence; "" = nothing
+    """
+
+    state: State
+    condition: Condition
+    failed: Condition | None
+    mode_failure: str
+    way_out: str
+    answers: list[tuple[OperatorCommand, CommandAnswer]]
+    radius_m: float
+    height_m: float
+    angular_speed_deg_s: float
+    radius_error_m: float
+    yaw_error_deg: float
+    subject_position: np.ndarray
+    action: Action
+
+    @property
+    def reason(self) -> str:
+        """Why the controller is in its state, and what leads out of it, as a sentence."""
+        failed = "" if self.failed in (None, self.condition) else str(self.failed)
+        present = f"{self.condition} ({self.mode_failure})" if self.mode_failure else str(self.condition)
+        return "; ".join(filter(None, (present, failed, self.way_out)))
+
 
 _STANDING_M_S = 0.05  # speed below which a setpoint stands
 _GIMBAL_PERIOD_S = 0.5  # between pitches of the mount: radius and height change slowly
@@ -55,8 +87,6 @@ _MODE_AGE_STEPS = 1.5  # a report of the mode is seen in the step that follows i
 class OrbitController:
     """Flies the orbit through a link.  States, images and commands may come from other threads than the steps.
 
-    Parameters
-    ----------
     link : to the autopilot; it sends motion only with ``commands_enabled``
     watchdog : gets the fallback commands of every step, when given
     """
@@ -109,8 +139,6 @@ class OrbitController:
     def step(self, now_ns: int, now_s: float) -> ControlStatus:
         """One step of the control loop.
 
-        Parameters
-        ----------
         now_ns : clock of the stamps
         now_s : monotonic
         """

@@ -20,7 +20,7 @@ from drocap_ros.flight.autopilot.autopilot import Echo
 from drocap_ros.flight.bridge_config import OrbitConfig
 from drocap_ros.flight.mavlink.commands import Message
 from drocap_ros.flight.orbit.motion_checks import away_limit_m
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 
 _SENT_S = 0.7  # a setpoint may be echoed for so long at most: two transmissions and the period of the echo
 _ECHOED_S = 0.25  # two periods of the echo, and a step: beyond its age and two transmissions, and without agreement
@@ -47,8 +47,6 @@ class Echoes(NamedTuple):
 class Following:
     """Judges an orbit step by step.
 
-    Parameters
-    ----------
     max_echo_age_s : time without any echo after which the setpoints count as not followed
     """
 
@@ -60,8 +58,6 @@ class Following:
     def step(self, now_s: float, orbiting_s: float, echoes: Echoes, vehicle: VehicleState | None) -> str:
         """Why the setpoints count as not followed, in words; "" = they are followed, or it is not known.
 
-        Parameters
-        ----------
         now_s : monotonic
         orbiting_s : how long the orbit has been flown; 0 = it is not
         """

@@ -9,7 +9,7 @@ import numpy as np
 
 from drocap_ros.flight.bridge_config import SafetyConfig
 from drocap_ros.flight.conditions import PICTURE_CODES, Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
+from drocap_ros.flight.mavlink.reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import subject_located
 from drocap_ros.flight.orbit.states import (

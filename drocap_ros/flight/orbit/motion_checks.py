@@ -13,7 +13,7 @@ from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.flight.observed import FIX_3D, Observed
 from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
+from drocap_ros.flight.vehicle import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
 _C = ConditionCode
 REACTION_S = 0.5  # from a step of the subject until the vehicle slows down

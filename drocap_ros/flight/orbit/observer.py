@@ -19,8 +19,7 @@ from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
-from drocap_ros.flight.vehicle_filter import Doubt, PoseHistory, VehicleFilter
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import Doubt, PoseHistory, VehicleFilter, VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.stamps import NS
@@ -116,8 +115,6 @@ class Observer:
     def observe(self, link: MavlinkLink, now_ns: int, now_s: float, own: OwnFlight) -> tuple[Observed, float]:
         """The observation of a step, and the time in s since the last one.
 
-        Parameters
-        ----------
         now_ns : clock of the stamps
         now_s : monotonic
         """

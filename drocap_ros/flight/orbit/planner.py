@@ -14,14 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.autopilot.coasting import Setpoint
-from drocap_ros.flight.bridge_config import OrbitConfig, OrbitGoal
+from drocap_ros.flight.bridge_config import FLIGHT_ERROR_M, OrbitConfig, OrbitGoal
 from drocap_ros.flight.orbit.motion_checks import REACTION_S
 from drocap_ros.flight.orbit.speed import allowed_angular_speed, approach_speed, waiting
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
 _TRIM_RATE = 0.15  # 1/s, about one who stands
 _WALKING_TRIM_RATE = 0.03  # 1/s: the turns of one who walks are no lasting error
-_FLIGHT_ERROR_M = 0.5  # of the flown radius: of the least one, and the most that is trimmed
 _CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
 _CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
 _FORWARD_S = 0.5  # s; filter of the centre's acceleration
@@ -83,7 +82,7 @@ def least_radius(
     surprise = max(REACTION_S * speed, speed**2 / (2 * braking_m_s2))
     worst = _WORST_RANGE * size_error * config.min_distance_m
     nearer = max(2 * subject_sd_m, nearer_m + subject_sd_m, worst)
-    return config.min_distance_m + nearer + surprise + _FLIGHT_ERROR_M
+    return config.min_distance_m + nearer + surprise + FLIGHT_ERROR_M
 
 
 def begin_orbit(vehicle: np.ndarray, subject: np.ndarray, config: OrbitConfig) -> OrbitState:
@@ -152,9 +151,9 @@ def advance(state: OrbitState, goal: OrbitGoal, scene: Scene, dt: float, config:
     if creep == 1.0:
         error = radius.value - float(np.hypot(*(vehicle[:2] - subject[:2])))
         error = min(max(error, -1.0), 1.0)
-        most = min(max(radius.value - least_radius_m, 0.0), _FLIGHT_ERROR_M)  # no nearer than the least radius
+        most = min(max(radius.value - least_radius_m, 0.0), FLIGHT_ERROR_M)  # no nearer than the least radius
         rate = _TRIM_RATE if math.hypot(*centre_velocity) < WALKING_M_S else _WALKING_TRIM_RATE
-        trim = min(max(trim + rate * error * dt, -most), _FLIGHT_ERROR_M)
+        trim = min(max(trim + rate * error * dt, -most), FLIGHT_ERROR_M)
     phase = math.remainder(phase, 2 * math.pi)
     return OrbitState(phase, omega, radius, height, *followed, trim, state.flown_s + dt, goal_radius)
 

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
+from drocap_ros.flight.mavlink.reports import MAX_LOSS
+from drocap_ros.flight.mavlink.telemetry_request import CURRENT_MODE_HZ
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.hold import (
     begin_hold,
@@ -52,7 +53,7 @@ from drocap_ros.flight.orbit.watchdog import GIVE_UP_S
 _C = ConditionCode
 _BLIND_MODE_REQUEST_S = 2.0  # of velocity zero, from 2.5 m/s at braking_m_s2: a brake by the mode takes longer
 _CLEAR_S = 1.0  # for which all conditions hold before an orbit resumes by itself
-_INTENTION_S = 1.0  # two periods of CURRENT_MODE, which says what is intended
+_INTENTION_S = 2.0 / CURRENT_MODE_HZ  # two periods of CURRENT_MODE, which says what is intended
 
 
 def reduce(
@@ -60,8 +61,6 @@ def reduce(
 ) -> tuple[SafetyState, Decision]:
     """One step of the machine.
 
-    Parameters
-    ----------
     now_s : monotonic
     command : the operator's, or None
 
@@ -252,9 +251,14 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
 
 
 def _request(state: Requesting, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
-    """While control is requested; a short gap of the data delays the orbit."""
+    """While control is requested; a short gap of the data delays the orbit.
+
+    The vehicle is held where it is, not where it was when control was asked for: the pilot flies it until the
+    autopilot grants control, and that is seen late.
+    """
     cause = _ending(state, seen, limits)
     if cause is None:
+        state = dataclasses.replace(state, position=seen.vehicle.position.copy(), yaw=seen.vehicle.yaw)
         if seen.mode.in_control and not problem:
             return _begin_orbit(seen, now_s)
         if now_s - state.since_s <= limits.safety.engage_timeout_s + limits.warm_up_s:

@@ -259,8 +259,6 @@ def harmless(
     about one who walks: a vehicle that falls behind along the orbit keeps its radius.  Where setpoints are continued,
     it would come near one who stands too fast as the radius shrinks.
 
-    Parameters
-    ----------
     fence_centre : (2,) m; None = there is no fence
     """
     held, velocity = not seen.autopilot.continues_setpoints, complex(*seen.subject.velocity[:2])

@@ -32,8 +32,6 @@ class FallbackCommands(NamedTuple):
 class Watchdog:
     """Sends the fallback commands of the last step once the loop has not stepped for ``limit_s``.
 
-    Parameters
-    ----------
     send : sends a message without waiting for any lock
     limit_s : time without :meth:`kick`
     hand_over : gives the hold of each step to the guardian, which outlives this process

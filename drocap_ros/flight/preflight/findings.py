@@ -12,7 +12,7 @@ import numpy as np
 
 from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.conditions import Condition, ConditionCode
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 
 #: Share of the time above which a failing condition is no mere gap.
 LASTING = 0.5

@@ -11,7 +11,7 @@ from drocap_ros.flight.autopilot import UNKNOWN, Autopilot, autopilot_of
 from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
+from drocap_ros.flight.mavlink.reports import MAX_LOSS
 from drocap_ros.flight.preflight.findings import Finding, Measured, Stream, Verdict, check, graded
 
 _C = ConditionCode

@@ -27,7 +27,7 @@ from drocap_ros.flight.preflight.findings import LASTING, Finding, Measured, Str
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
 from drocap_ros.flight.preflight.vehicle_checks import vehicle_findings
-from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, VehicleState
+from drocap_ros.flight.vehicle import LANDED_IN_AIR, VehicleState
 from drocap_ros.stamps import NS
 
 _CONDITIONS_PERIOD_S = 0.1  # between looks at the conditions for motion: two steps of the loop
@@ -97,8 +97,6 @@ class ListeningLink(MavlinkLink):
 class Listening:
     """One session of listening: :meth:`turn` again and again until :attr:`done`, then :meth:`measured`.
 
-    Parameters
-    ----------
     seconds : since the first message of the autopilot; without one, since the beginning
     keywords : of :class:`MavlinkLink`
     """

@@ -15,7 +15,7 @@ from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.observed import Motion
 from drocap_ros.flight.preflight.findings import Finding, Values, Verdict, check, graded
 from drocap_ros.flight.subject.framing import Framing, View, orbit_margin
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 
 _C = ConditionCode
 _EDGE = 0.04  # share of the picture's rows: detectors lose feet and head nearer to the border

@@ -11,7 +11,7 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.motion_checks import LANDED_STATES, battery_condition, loss_condition
 from drocap_ros.flight.preflight.findings import LASTING, Finding, Measured, Stream, Values, Verdict, check, graded
-from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, SATELLITES_UNKNOWN, VehicleState
+from drocap_ros.flight.vehicle import LANDED_IN_AIR, SATELLITES_UNKNOWN, VehicleState
 
 _C = ConditionCode
 _CAMERA = (_C.CAMERA_UNKNOWN, _C.MOUNT_TYPE_UNKNOWN, _C.MOUNT_OUTDATED)

@@ -16,7 +16,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig, OrbitGoal
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 
 _GRAVITY = 9.81  # m/s^2
@@ -50,8 +50,6 @@ def framing_margin(
 ) -> np.ndarray:
     """(N,) distance of the person from the nearest border, as a share of the picture's height; negative = outside.
 
-    Parameters
-    ----------
     distance_m : horizontal, along the nose
     height_m : of the camera above the person's ground
     ahead, left : (N,) rad, lean of the body: nose down, left side down

@@ -21,7 +21,7 @@ from drocap_ros.flight.subject.subject_measurement import (
     SubjectMeasurement,
     locate_subject,
 )
-from drocap_ros.flight.vehicle_filter import CameraPose
+from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.observation import PoseObservation
 from drocap_ros.stamps import NS
 
@@ -39,8 +39,6 @@ _MOST = 2.0  # standard deviations of the range by body size, by which the scale
 class Parallax:
     """Sums over pictures of one subject who stands; ``scale`` multiplies a measured range.
 
-    Parameters
-    ----------
     size_error : standard deviation of the range by body size, as a share: what is believed before the vehicle moves
     """
 
@@ -58,8 +56,6 @@ class Parallax:
     def take(self, place: np.ndarray, sight: np.ndarray, seconds: float) -> None:
         """Take a picture.
 
-        Parameters
-        ----------
         place : (2,) m, of the camera in the map frame
         sight : (2,) m, from there to the subject as measured, without this scale
         seconds : since the picture before
@@ -146,8 +142,6 @@ class Guard:
     def sight(self, vehicle: np.ndarray, offset: np.ndarray, now_ns: int) -> SizeSight | None:
         """The subject as the vehicle sees him now; None = no image had a size yet.
 
-        Parameters
-        ----------
         vehicle : (3,) m, in the frame of the reported position
         offset : (3,) m, from the frame of the camera's poses to that one
         """

@@ -10,7 +10,7 @@ import numpy as np
 from drocap_ros.flight.bridge_config import SubjectConfig
 from drocap_ros.flight.subject.guard import Parallax
 from drocap_ros.flight.subject.subject_measurement import MAX_BENDING, SubjectMeasurement, locate_subject
-from drocap_ros.flight.vehicle_filter import CameraPose
+from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.observation import PoseObservation
 from drocap_ros.stamps import NS
 

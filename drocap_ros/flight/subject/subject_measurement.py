@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.bridge_config import SubjectConfig
-from drocap_ros.flight.vehicle_filter import CameraPose
+from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.observation import PoseObservation
 from drocap_ros.skeleton import BODY_15, joint_map
 
@@ -97,8 +97,6 @@ def locate_subject(
 ) -> SubjectMeasurement | None:
     """Locate the subject in one image.
 
-    Parameters
-    ----------
     observation : keypoints of any joint set that maps to ``BODY_15``
     camera_matrix : (3, 3) px
     camera : pose at the stamp of the observation

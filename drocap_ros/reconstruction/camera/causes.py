@@ -99,12 +99,11 @@ def single_causes(
 
 def _columns(given: CameraTelemetry, found: AdjustedPath, frame: np.ndarray) -> np.ndarray:
     """(6 K, 1 + causes) the difference of the paths at the knots, and what one rad or s of every cause makes of it."""
-    path = given.shifted(0.0, 0.0)
     columns = np.zeros((len(frame), KNOT, 1 + len(_CAUSES)))
     columns[:, :3, 0] = (found.position - given.position)[frame]
     columns[:, 3:, 0] = log_so3(found.rotation @ np.swapaxes(given.rotation, 1, 2))[frame]
     columns[:, 3:, 1:4] = given.gimbal_axes().T
-    columns[:, 3:, 4], columns[:, :3, 5] = path.turn_rate[frame], path.velocity[frame]
+    columns[:, 3:, 4], columns[:, :3, 5] = given.turn_rate[frame], given.velocity[frame]
     columns[:, :, 6] = columns[:, :, 4] + columns[:, :, 5]
     return columns.reshape(-1, 1 + len(_CAUSES))
 

@@ -126,13 +126,14 @@ class PathResiduals:
     def _correct(self) -> None:
         """The corrected path."""
         shared = self.state.shared
-        path = self.data.path.shifted(float(shared[ATTITUDE_LATENCY]), float(shared[POSITION_LATENCY]))
+        path = self.data.path
+        rotation, position = path.shifted(float(shared[ATTITUDE_LATENCY]), float(shared[POSITION_LATENCY]))
         self.errors = self.data.knots.at_frames(self.state.errors) + self.state.rest
         self.turn = shared[MISALIGNMENT] + self.errors[:, 3:]
         correction = exp_so3(self.turn)
-        self.rotation = correction @ path.rotation
+        self.rotation = correction @ rotation
         self.turn_rate = np.einsum("fij,fj->fi", correction, path.turn_rate)
-        self.position, self.velocity = path.position + self.errors[:, :3], path.velocity
+        self.position, self.velocity = position + self.errors[:, :3], path.velocity
 
     def _compare_image(self) -> None:
         """Projected points with the seen ones."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from drocap_ros.geometry.interpolation import smoothed
@@ -13,23 +11,10 @@ from drocap_ros.geometry.rotations import exp_so3, log_so3
 _SMOOTHING_S = 0.25
 
 
-class ShiftedPath(NamedTuple):
-    """The camera at every frame, reported so much later.
-
-    rotation : (F, 3, 3) world -> camera
-    turn_rate : (F, 3) rad/s in camera axes
-    position, velocity : (F, 3) m, m/s
-    """
-
-    rotation: np.ndarray
-    turn_rate: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-
-
 class CameraTelemetry:
     """Reported rotations (F, 3, 3) world -> camera and positions (F, 3) m of evenly spaced frames.
 
+    turn_rate : (F, 3) rad/s in camera axes; velocity : (F, 3) m/s, both smooth
     A latency shifts the path by its smoothed motion only: interpolation between frames would average the noise of the
     reports, and an adjustment would take the latency that averages most.
     """
@@ -45,9 +30,9 @@ class CameraTelemetry:
             step = log_so3(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)) * fps
             turn = np.concatenate([step[:1], 0.5 * (step[1:] + step[:-1]), step[-1:]])
         smoothing = _SMOOTHING_S * fps
-        self._turn_rate = gaussian_filter1d(turn, smoothing, axis=0, mode="nearest")
+        self.turn_rate = gaussian_filter1d(turn, smoothing, axis=0, mode="nearest")
         self._smooth = smoothed(position, smoothing)
-        self._velocity = np.gradient(self._smooth, axis=0) * fps if self.frames > 1 else np.zeros((self.frames, 3))
+        self.velocity = np.gradient(self._smooth, axis=0) * fps if self.frames > 1 else np.zeros((self.frames, 3))
 
     def gimbal_axes(self) -> np.ndarray:
         """(3, 3) rows in camera axes, of the whole recording: pitch, yaw (about the vertical, clockwise) and roll."""
@@ -58,11 +43,11 @@ class CameraTelemetry:
         right /= np.linalg.norm(right)
         return np.stack([right, down, np.cross(right, down)])
 
-    def shifted(self, attitude_s: float, position_s: float) -> ShiftedPath:
-        """The path with the attitude and the position of so many seconds later."""
+    def shifted(self, attitude_s: float, position_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (F, 3, 3) and positions (F, 3) of so many seconds later."""
         moved = self._smooth_at(position_s) - self._smooth
-        rotation = exp_so3(self._turn_rate * attitude_s) @ self.rotation
-        return ShiftedPath(rotation, self._turn_rate, self.position + moved, self._velocity)
+        rotation = exp_so3(self.turn_rate * attitude_s) @ self.rotation
+        return rotation, self.position + moved
 
     def roughness(self) -> float:
         """Standard deviation (m) of the position's change from frame to frame that no camera could fly."""
@@ -77,7 +62,7 @@ class CameraTelemetry:
         inside = np.clip(frame, 0, self.frames - 1)
         at = np.arange(self.frames)
         path = np.stack([np.interp(inside, at, self._smooth[:, axis]) for axis in range(3)], axis=1)
-        ends = np.where((frame < inside)[:, None], self._velocity[0], self._velocity[-1])
+        ends = np.where((frame < inside)[:, None], self.velocity[0], self.velocity[-1])
         return np.asarray(path + ends * ((frame - inside) / self.fps)[:, None])
 
 

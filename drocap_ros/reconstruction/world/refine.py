@@ -334,9 +334,9 @@ def _start(
 def _correction(state: WorldState, telemetry: CameraTelemetry) -> np.ndarray:
     """(F, 6) corrections of the reported position (m) and rotation (rad, camera axes)."""
     shared = state.globals
-    path = state.path(telemetry)
-    position = path.position - telemetry.position + state.camera[:, :3]
-    turned = shared[MISALIGNMENT] + state.camera[:, 3:] + path.turn_rate * shared[ATTITUDE_LATENCY]
+    _, place = state.path(telemetry)
+    position = place - telemetry.position + state.camera[:, :3]
+    turned = shared[MISALIGNMENT] + state.camera[:, 3:] + telemetry.turn_rate * shared[ATTITUDE_LATENCY]
     return np.concatenate([position, turned], axis=1)
 
 

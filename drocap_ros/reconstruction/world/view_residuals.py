@@ -101,13 +101,14 @@ class ViewResiduals:
 
     def _see(self) -> None:
         """The camera's corrected path, and the joints in its axes."""
-        shared, camera, path = self.state.globals, self.state.camera, self.state.path(self.data.telemetry)
+        shared, camera, telemetry = self.state.globals, self.state.camera, self.data.telemetry
+        rotation, position = self.state.path(telemetry)
         self.turn = shared[MISALIGNMENT] + camera[:, 3:]
         correction = exp_so3(self.turn)
-        self.rotation = correction @ path.rotation
-        self.position = path.position + camera[:, :3]
-        self.velocity = path.velocity
-        self.turn_rate = np.einsum("fij,fj->fi", correction, path.turn_rate)
+        self.rotation = correction @ rotation
+        self.position = position + camera[:, :3]
+        self.velocity = telemetry.velocity
+        self.turn_rate = np.einsum("fij,fj->fi", correction, telemetry.turn_rate)
         offset = self.state.joints - shared[SCALE] * self.position[:, None]
         self.seen = offset @ np.swapaxes(self.rotation, 1, 2)
         # Along the reported view, a lifter whose bodies lean would turn the camera.

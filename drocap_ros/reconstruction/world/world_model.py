@@ -14,7 +14,7 @@ import numpy as np
 from drocap_ros.camera_path import CameraErrors, CameraPath
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
-from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, ShiftedPath
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Relative standard deviation of the scale below which it counts as measured: half of that among people.
@@ -220,7 +220,7 @@ class WorldState:
     camera: np.ndarray
     globals: np.ndarray
 
-    def path(self, telemetry: CameraTelemetry) -> ShiftedPath:
+    def path(self, telemetry: CameraTelemetry) -> tuple[np.ndarray, np.ndarray]:
         """The telemetry shifted by the latencies, without the other errors."""
         return telemetry.shifted(float(self.globals[ATTITUDE_LATENCY]), float(self.globals[POSITION_LATENCY]))
 

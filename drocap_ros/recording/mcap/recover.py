@@ -15,6 +15,9 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Schema
+
 from drocap_ros import __version__
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap import metadata as bag
@@ -52,6 +55,8 @@ class McapFile:
         self._in_closed_chunks: Counter[str] = Counter()
         self._channels: dict[str, int] = {}
         self._schemas: dict[tuple[str, str], int] = {}
+        self._declared: list[Schema | Channel] = []
+        self._chunks = 0
         kinds = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
         self._file = CommittedFile(path)
         self._mcap = Writer(self._file, chunk_size=chunk_bytes, compression=kinds[compression])  # type: ignore[arg-type]
@@ -84,16 +89,18 @@ class McapFile:
         """
         kind = (topic.type_name, schema)
         if kind not in self._schemas:
-            known = bool(schema or schema_encoding)
-            self._schemas[kind] = (
-                self._mcap.register_schema(topic.type_name, schema_encoding, schema.encode()) if known else 0
-            )
-        key = key or topic.name
-        self._channels[key] = self._mcap.register_channel(
-            topic=topic.name,
-            message_encoding=encoding,
-            schema_id=self._schemas[kind],
-            metadata=dict(metadata) if metadata is not None else {"offered_qos_profiles": dump_yaml(topic.qos)},
+            number = 0
+            if schema or schema_encoding:
+                data = schema.encode()
+                number = self._mcap.register_schema(topic.type_name, schema_encoding, data)
+                self._declared.append(Schema(id=number, data=data, encoding=schema_encoding, name=topic.type_name))
+            self._schemas[kind] = number
+        key, schema_id = key or topic.name, self._schemas[kind]
+        values = dict(metadata) if metadata is not None else {"offered_qos_profiles": dump_yaml(topic.qos)}
+        number = self._mcap.register_channel(topic.name, encoding, schema_id, values)
+        self._channels[key] = number
+        self._declared.append(
+            Channel(id=number, message_encoding=encoding, metadata=values, schema_id=schema_id, topic=topic.name)
         )
         self.topics[key] = TopicRecord(topic.name, topic.type_name, topic.type_hash, topic.qos)
 
@@ -130,8 +137,9 @@ class McapFile:
 
     def finish(self, sync: bool) -> None:
         """Write the summary and close; errors as :meth:`save`."""
-        self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap has no types here
+        self._mcap.flush()  # type: ignore[no-untyped-call]  # mcap has no types here
         self._chunk_closed()
+        self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap has no types here
         self.commit(sync)
         self._file.close()
 
@@ -145,8 +153,18 @@ class McapFile:
         return lost
 
     def _chunk_closed(self) -> None:
+        if not self._in_open_chunk:
+            return
         self._in_closed_chunks += self._in_open_chunk
         self._in_open_chunk.clear()
+        self._chunks += 1
+        if self._chunks & (self._chunks - 1) == 0:
+            # The library declares channels in the first chunk alone: without it no message would be known.  Behind
+            # every first, second, fourth chunk and so on they stand again.
+            builder = RecordBuilder()
+            for record in self._declared:
+                record.write(builder)
+            self._file.write(builder.end())  # type: ignore[no-untyped-call]  # mcap has no types here
 
 
 class CommittedFile:

@@ -10,9 +10,11 @@ import io
 import logging
 import re
 import struct
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import chain
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, NamedTuple
 
@@ -129,14 +131,16 @@ class McapStream:
         from mcap.records import Channel, Header, Message, Metadata, Schema
 
         schemas: dict[int, Schema] = {}
-        channels: dict[int, McapChannel] = {}
-        lost = 0
+        channels = self._declared() if self.resync else {}
+        lost, searched = 0, self.resync
         for record in self._records():
             if isinstance(record, Schema):
-                schemas[record.id] = record
+                schemas.setdefault(record.id, record)
             elif isinstance(record, Channel):
-                channels[record.id] = _channel(record, schemas.get(record.schema_id))
+                channels.setdefault(record.id, _channel(record, schemas.get(record.schema_id)))
             elif isinstance(record, Message):
+                if record.channel_id not in channels and not searched:
+                    channels, searched = self._declared() | channels, True
                 channel = channels.get(record.channel_id)
                 if channel is None:
                     lost += 1
@@ -148,6 +152,25 @@ class McapStream:
                 self._metadata.setdefault(record.name, {}).update(record.metadata)
         if lost:
             self.damage.append(Damage(DamageKind.UNKNOWN_CHANNELS, amount=lost))
+
+    def _declared(self) -> dict[int, McapChannel]:
+        """Channels by what most of their declarations in the file say: damage may have hit some of them."""
+        from mcap.records import Channel, Schema
+
+        said: dict[tuple[type, int], Counter[str]] = defaultdict(Counter)
+        records: dict[str, McapRecord] = {}
+        summary = self.summary()
+        last = [] if summary is None else [*summary.schemas.values(), *summary.channels.values()]
+        for record in chain(McapStream(self.path, resync=True)._records(), last):
+            if isinstance(record, Schema | Channel):
+                said[type(record), record.id][text := repr(record)] += 1
+                records[text] = record
+        most = {of: records[texts.most_common(1)[0][0]] for of, texts in said.items()}
+        return {
+            record.id: _channel(record, most.get((Schema, record.schema_id)))  # type: ignore[arg-type]
+            for record in most.values()
+            if isinstance(record, Channel)
+        }
 
     def summary(self) -> Summary | None:
         """The file's own summary, or None where there is no usable one."""
@@ -179,6 +202,7 @@ class McapStream:
         return found
 
     def _records(self) -> Iterator[McapRecord]:
+        """Records of the file and of its whole chunks."""
         from mcap.records import Chunk
         from mcap.stream_reader import breakup_chunk
 
@@ -187,46 +211,55 @@ class McapStream:
         except OSError as error:
             raise InputError(f"{self.path}: expected a readable file; {error.strerror}") from None
         with file:
-            if file.read(len(MAGIC)) != MAGIC:
+            magic, bad_chunks = file.read(len(MAGIC)), 0
+            if magic != MAGIC and not (self.resync and _few_bits_apart(magic, MAGIC)):
                 raise InputError(
                     f"{self.path}: expected an MCAP file, found other content at its start; check the path"
                 )
-            file.seek(0)
-            bad_chunks = 0
-            for record in self._raw_records(file):
-                if not isinstance(record, Chunk):
-                    yield record
-                    continue
-                try:
-                    records = breakup_chunk(_unpacked(record), validate_crc=True)
-                except Exception:  # noqa: BLE001  # decompression, checksum, lengths: a damaged chunk fails in many ways
-                    bad_chunks += 1
-                    continue
-                yield from records
+            place: int | None = file.tell()
+            while place is not None:
+                begin, place = place, None
+                for record, start, end in self._until_damaged(file, begin):
+                    whole = False
+                    if isinstance(record, Chunk):
+                        try:
+                            records = breakup_chunk(_unpacked(record), validate_crc=True)
+                            whole = True
+                        except Exception:  # noqa: BLE001  # decompression, checksum, lengths: a chunk fails in many ways
+                            bad_chunks += 1
+                            records = []
+                        yield from records
+                    else:
+                        yield record
+                    # A wrong length swallows the chunks behind it.
+                    if self.resync and not whole and (place := _next_chunk(file, start + 1, end)) is not None:
+                        break
+                    file.seek(end)
+                else:
+                    place = self._behind_damage(file)
             if bad_chunks:
                 self.damage.append(Damage(DamageKind.DAMAGED_CHUNKS, amount=bad_chunks))
 
-    def _raw_records(self, file: _BoundedFile) -> Iterator[McapRecord]:
+    def _behind_damage(self, file: _BoundedFile) -> int | None:
+        """Where the next chunk is, behind the record at which reading ended; None = nowhere, or nothing was damaged."""
+        if (
+            not self.resync
+            or not self.damage
+            or self.damage[-1] != Damage(DamageKind.CUT_OFF, self._whole_until, file.size)
+        ):
+            return None
+        place = _next_chunk(file, self._whole_until + 1, file.size)
+        if place is not None:
+            self.damage[-1] = Damage(DamageKind.SKIPPED_BYTES, self._whole_until, place - self._whole_until)
+        return place
+
+    def _until_damaged(self, file: _BoundedFile, place: int) -> Iterator[tuple[McapRecord, int, int]]:
+        """Records from a place on, with the places of their first byte and of that behind them."""
+        from mcap.records import Footer
         from mcap.stream_reader import StreamReader
 
-        skip = False
-        while True:
-            reader = StreamReader(file, skip_magic=skip, emit_chunks=True, record_size_limit=file.size)
-            known = len(self.damage)
-            yield from self._until_damaged(iter(reader.records), file)
-            if not self.resync or len(self.damage) == known:
-                return
-            place = _next_chunk(file, self._whole_until + 1)
-            if place is None:
-                return
-            self.damage[-1] = Damage(DamageKind.SKIPPED_BYTES, self._whole_until, place - self._whole_until)
-            file.seek(place)
-            skip = True
-
-    def _until_damaged(self, records: Iterator[McapRecord], file: _BoundedFile) -> Iterator[McapRecord]:
-        from mcap.records import Footer
-
-        ended, place = False, file.tell()
+        file.seek(place)
+        records = iter(StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=file.size).records)
         while True:
             self._whole_until = place
             try:
@@ -234,25 +267,32 @@ class McapStream:
             except StopIteration:
                 return
             except Exception:  # noqa: BLE001  # mcap raises many kinds on cut or damaged records
-                if not ended:
-                    self.damage.append(Damage(DamageKind.CUT_OFF, place, file.size))
+                self.damage.append(Damage(DamageKind.CUT_OFF, place, file.size))
                 return
-            ended = ended or isinstance(record, Footer)
-            place = file.tell()
-            yield record
+            start, place = place, file.tell()
+            if isinstance(record, Footer):
+                if file.size - place > len(MAGIC):  # it is none: the end of a file follows
+                    self.damage.append(Damage(DamageKind.CUT_OFF, start, file.size))
+                return
+            yield record, start, place
 
 
-def _next_chunk(file: IO[bytes], start: int) -> int | None:
-    """Offset of the next record at or after ``start`` that has the form of a chunk and fits into the file."""
+def _few_bits_apart(found: bytes, expected: bytes) -> bool:
+    """Whether bytes are the expected ones but for up to three bits: damaged, and no other format."""
+    return len(found) == len(expected) and sum((a ^ b).bit_count() for a, b in zip(found, expected, strict=True)) <= 3
+
+
+def _next_chunk(file: IO[bytes], start: int, stop: int) -> int | None:
+    """Offset of the first record in [start, stop) that has the form of a chunk and fits into the file."""
     size = file.seek(0, 2)
     overlap = _CHUNK_HEAD.size
     place = start
-    while place < size - overlap:
+    while place < min(stop, size - overlap):
         file.seek(place)
-        data = file.read(_SEARCH + overlap)
+        data = file.read(min(_SEARCH, stop - place) + overlap)
         for match in _COMPRESSION.finditer(data):
             at = match.start() - _CHUNK_HEAD.size + 4
-            if at < 0 or data[at] != _CHUNK_OPCODE:
+            if at < 0 or place + at >= stop or data[at] != _CHUNK_OPCODE:
                 continue
             _, length, begin, end, unpacked, _, _ = _CHUNK_HEAD.unpack_from(data, at)
             if place + at + 9 + length <= size and begin <= end and unpacked <= _MAX_CHUNK:

@@ -18,6 +18,9 @@ from drocap_ros.recording.mcap.metadata import METADATA_FILE, METADATA_RECORD, F
 from drocap_ros.recording.mcap.recover import McapFile
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 
+#: MCAP's times are unsigned nanoseconds of 64 bits.
+_END_NS = 1 << 64
+
 
 class QueuedMessage(NamedTuple):
     """One serialized message."""
@@ -59,7 +62,8 @@ class BoundedQueue:
                     _, victim = self._images.popleft()
                     self.size -= len(victim.data)
                     self.dropped[victim.topic] += 1
-            if self.closed or self.size + size > limit:
+            stamped = 0 <= message.log_time_ns < _END_NS and 0 <= message.publish_time_ns < _END_NS
+            if self.closed or not stamped or self.size + size > limit:
                 self.dropped[message.topic] += 1
                 return False
             (self._images if image else self._others).append((self._arrivals, message))
@@ -211,7 +215,7 @@ class SessionWriter:
             self._description_changed = True
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> bool:
-        """Queue one serialized (CDR) message; False when it was dropped."""
+        """Queue one serialized (CDR) message; False when it was dropped, as one of a time before 1970 is."""
         if topic not in self._topics:
             raise InputError(f"{topic}: expected a registered topic; call register first")
         published_ns = log_time_ns if publish_time_ns is None else publish_time_ns

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.flight.vehicle_state import orientation_to_ros, quaternion_from_euler
+from drocap_ros.flight.vehicle import orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import (
     Lack,

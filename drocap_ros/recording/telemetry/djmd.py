@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.vehicle_state import orientation_to_ros
+from drocap_ros.flight.vehicle import orientation_to_ros
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.recording.telemetry import djmd_layouts as layouts
 from drocap_ros.recording.telemetry.djmd_layouts import Layout, Message, Model, Value

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.vehicle_state import camera_rotation, orientation_to_ros, quaternion_from_euler
+from drocap_ros.flight.vehicle import camera_rotation, orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.geometry.interpolation import interpolate, true_runs
 from drocap_ros.geometry.position_steps import without_steps

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.flight.vehicle_state import ned_to_enu, orientation_to_ros, yaw_of
+from drocap_ros.flight.vehicle import ned_to_enu, orientation_to_ros, yaw_of
 from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import (
     Lack,

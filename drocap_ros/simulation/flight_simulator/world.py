@@ -10,7 +10,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.transport import Transport
-from drocap_ros.flight.vehicle_state import camera_rotation
+from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import MAX_EXPOSURES, FlightTruth
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
@@ -140,8 +140,6 @@ class Exposure(NamedTuple):
 class FlightWorld:
     """Stepped in time; keeps its exposures as the truth.
 
-    Parameters
-    ----------
     transport : the vehicle's end of the MAVLink link; closed by :meth:`close`
     """
 

@@ -75,8 +75,6 @@ def joined(parts: list[Quadrics]) -> Quadrics:
 def rasterize(quadrics: Quadrics, matrix: np.ndarray, width: int, height: int, light: np.ndarray) -> Layer | None:
     """Rasterize the nearest surface at each pixel.
 
-    Parameters
-    ----------
     quadrics : in the camera's frame (x right, y down, z forward)
     matrix : (3, 3) px without skew, pixel centres at whole numbers
     width, height : px of the image

@@ -23,8 +23,6 @@ _MOST_PX = 8192
 class Renderer:
     """A camera in a scenery; the same seed gives the same scenery and clothes, hence the same images.
 
-    Parameters
-    ----------
     camera_matrix : (3, 3) px without skew, pixel centres at whole numbers
     width, height : px of the images
     seed : of the scenery and of the look of the person
@@ -43,8 +41,6 @@ class Renderer:
     def render(self, joints3d: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR.
 
-        Parameters
-        ----------
         joints3d : (17, 3) m, world ENU, order of ``BODY_17``; (15, 3) without toes, which the feet then assume
         rotation : (3, 3) world -> camera (x right, y down, z forward)
         position : (3,) m, of the camera, world ENU

@@ -12,7 +12,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.transport import Transport
-from drocap_ros.flight.vehicle_state import ned_to_enu
+from drocap_ros.flight.vehicle import ned_to_enu
 from drocap_ros.simulation.vehicle.copter_reports import EKF_NOTICED_S, CopterSetup, ReportingCopter
 from drocap_ros.simulation.vehicle.flight_control import Target, manner_of
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drocap_ros.flight.autopilot import Autopilot
+from drocap_ros.flight.autopilot.autopilot import Gains, Simulated
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
-from drocap_ros.flight.autopilot.simulated import Gains, Simulated
 
 MAX_LEAN_M_S2 = 5.66  # 30 degrees
 _YAW_GAIN = 5.8  # 1/s: yaw errors of recorded orbits

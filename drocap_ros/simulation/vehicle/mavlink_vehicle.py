@@ -21,7 +21,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import AUTOPILOTS, autopilot_of
 from drocap_ros.flight.mavlink.parser import CurrentMode, MavlinkParser, sign_with
 from drocap_ros.flight.mavlink.transport import Transport, open_transport
-from drocap_ros.flight.vehicle_state import OPTICAL_FROM_FLU, enu_to_ned, flu_to_frd, orientation_to_aviation
+from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, enu_to_ned, flu_to_frd, orientation_to_aviation
 from drocap_ros.geometry.geodesy import enu_to_geodetic
 from drocap_ros.geometry.rotations import quaternion_from_matrix, slerp
 from drocap_ros.simulation.orbit_camera import orbit_camera
@@ -47,8 +47,6 @@ class FlightPath(Protocol):
 class SampledPath:
     """Path through sampled camera poses: the camera is at the vehicle's position, the nose follows its bearing.
 
-    Parameters
-    ----------
     t_s : (F,) increasing
     rotation : (F, 3, 3) world ENU -> camera optical
     position : (F, 3) m ENU
@@ -102,8 +100,6 @@ _GIMBAL_EARTH = _GIMBAL_FLAGS | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.G
 class SimulatedVehicle:
     """MAVLink vehicle on a link of its own.
 
-    Parameters
-    ----------
     link : a transport, or a URL of :func:`drocap_ros.flight.mavlink.transport.open_transport`
     path : None = the subclass overrides :meth:`at`
     autopilot : name of one that has a simulated counterpart

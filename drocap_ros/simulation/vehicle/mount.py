@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.vehicle_state import orientation_to_aviation, orientation_to_ros, quaternion_from_euler, yaw_of
+from drocap_ros.flight.vehicle import orientation_to_aviation, orientation_to_ros, quaternion_from_euler, yaw_of
 from drocap_ros.geometry.rotations import quaternion_multiply
 
 #: By the value of ArduPilot's MNT1_TYPE.

@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import AUTOPILOTS, UNKNOWN, autopilot_by_heartbeat, autopilot_of, supported_titles
-from drocap_ros.flight.mavlink.mode_reports import ModeReports
+from drocap_ros.flight.mavlink.reports import ModeReports
 
 EVERY = pytest.mark.parametrize("autopilot", AUTOPILOTS.values(), ids=AUTOPILOTS)
 

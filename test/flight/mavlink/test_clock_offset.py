@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drocap_ros.flight.mavlink.clock_offset import ClockOffset
+from drocap_ros.flight.mavlink.state_estimator import ClockOffset
 
 S = 1_000_000_000
 

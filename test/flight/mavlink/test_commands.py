@@ -17,7 +17,7 @@ from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.transport import LinkError
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
-from drocap_ros.flight.vehicle_state import ned_to_enu
+from drocap_ros.flight.vehicle import ned_to_enu
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 MAV = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)

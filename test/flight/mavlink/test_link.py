@@ -1,11 +1,10 @@
+import contextlib
 import fcntl
 import itertools
 import math
 import os
 import random
 import socket
-import subprocess
-import sys
 import threading
 import time
 
@@ -21,7 +20,7 @@ from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.mavlink.transport import open_transport
-from drocap_ros.flight.vehicle_state import camera_rotation
+from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.simulation.vehicle.mavlink_vehicle import HOME, SimulatedVehicle, orbit_path
 
 S = 1_000_000_000
@@ -137,27 +136,6 @@ def test_link_thread_delivers_states_and_stops(port):
         thread.join(2)
         assert not thread.is_alive()
     assert len(states) >= 5
-
-
-def test_link_to_a_vehicle_process(port):
-    command = [
-        sys.executable,
-        "-m",
-        "drocap_ros.simulation.vehicle.mavlink_vehicle",
-        "--url",
-        f"udpout:127.0.0.1:{port}",
-        "--autopilot",
-        "px4",
-        "--seconds",
-        "30",
-    ]
-    with MavlinkLink(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")) as link:
-        process = subprocess.Popen(command)
-        try:
-            assert spin_until(link, lambda s: len(s) > 3)[-1].autopilot == "px4"
-        finally:
-            process.terminate()
-            process.wait(5)
 
 
 def test_link_over_tcp(port):
@@ -317,6 +295,43 @@ def test_mutated_and_random_bytes_raise_nothing(port):
         else:
             pytest.fail("the link no longer works")
     out.close()
+
+
+@pytest.mark.parametrize("component", [100, 154, 191, 25])
+def test_setpoints_go_to_the_autopilot_whoever_else_of_its_system_talks_from_another_port(port, component):
+    """A camera, a gimbal, a companion, a servo: each sends before, between and after the autopilot's messages."""
+    config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", commands_enabled=True)
+    theirs = mavlink.MAVLink(None, srcSystem=1, srcComponent=component)
+    autopilots = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot,
+        MavlinkLink(config) as link,
+    ):
+        for sender in (other, autopilot):
+            sender.setblocking(False)
+
+        def send(sender, mav, message):
+            sender.sendto(message.pack(mav), ("127.0.0.1", port))
+            link.spin_once(0.05)
+
+        for i in range(50):
+            send(other, theirs, theirs.heartbeat_encode(30, 8, 0, 0, 4))
+            if i % 10 == 0:
+                send(autopilot, autopilots, autopilots.heartbeat_encode(2, 3, 129, 4, 4))
+            send(autopilot, autopilots, autopilots.attitude_quaternion_encode(10**6 + 20 * i, 1, 0, 0, 0, 0, 0, 0))
+            send(other, theirs, theirs.gimbal_device_attitude_status_encode(1, 0, 20 * i, 0, [1, 0, 0, 0], 0, 0, 0, 0))
+            link.send_motion(
+                link.mav.set_position_target_local_ned_encode(0, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+            )
+        received = dict.fromkeys((other, autopilot), 0)
+        for sender in received:
+            with contextlib.suppress(BlockingIOError):
+                while data := sender.recv(2048):
+                    received[sender] += sum(
+                        m.get_type() == "SET_POSITION_TARGET_LOCAL_NED" for m in MavlinkParser(None, 0).feed(data)
+                    )
+        assert received == {other: 0, autopilot: 50}
 
 
 def test_link_refuses_to_send_motion(port):

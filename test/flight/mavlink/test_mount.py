@@ -8,8 +8,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.mavlink.mount import Mount
-from drocap_ros.flight.vehicle_state import orientation_to_aviation, orientation_to_ros, quaternion_from_euler
+from drocap_ros.flight.mavlink.reports import Mount
+from drocap_ros.flight.vehicle import orientation_to_aviation, orientation_to_ros, quaternion_from_euler
 
 S = 1_000_000_000
 #: As ArduPilot sends it for every mount: roll and pitch "locked", yaw from the nose.
@@ -68,15 +68,6 @@ def test_without_a_report_the_camera_is_unknown():
     assert np.isfinite(mount.camera_at(NOSE_DOWN, 3 * S)).all()
     assert np.isnan(mount.camera_at(NOSE_DOWN, 5 * S)).all()  # silent: not replaced by a guess
     assert mount.kind == "gimbal"
-
-
-def test_yaw_from_the_nose_turns_with_the_nose():
-    mount = Mount()
-    mount.take(report(0, -20, 10), S)
-    for heading in (0.0, 90.0):
-        camera = mount.camera_at(quaternion_from_euler(0.0, 0.0, math.radians(heading)), S + S // 50)
-        ahead = Rotation.from_quat(camera).apply([1, 0, 0])
-        assert math.degrees(math.atan2(ahead[0], ahead[1])) == pytest.approx(heading + 10)
 
 
 def test_a_mount_that_reports_no_angles_is_outdated_sooner_than_a_silent_one():

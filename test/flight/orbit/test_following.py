@@ -12,7 +12,7 @@ from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
 from drocap_ros.flight.orbit.safety import reduce
 from drocap_ros.flight.orbit.states import Action, State
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 
 MAX_ECHO_AGE_S = 0.5
 

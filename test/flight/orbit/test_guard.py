@@ -9,7 +9,7 @@ from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.bridge_config import SubjectConfig
 from drocap_ros.flight.orbit.speed import limit_closing
 from drocap_ros.flight.subject.guard import Guard
-from drocap_ros.flight.vehicle_filter import CameraPose
+from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import pinhole_matrix

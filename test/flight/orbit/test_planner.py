@@ -219,13 +219,6 @@ def test_contradicting_orbit_parameters_are_refused(values, word):
     assert "\n" not in str(error.value)
 
 
-def test_nan_in_a_command_keeps_the_present_value():
-    config = OrbitConfig()
-    goal = goal_of(config, radius_m=8.0)
-    assert goal.height_m == 2.5
-    assert goal_of(config, height_m=4.0, present=goal) == (8.0, 4.0, goal.angular_speed_rad_s)
-
-
 @pytest.mark.parametrize(
     ("changes", "turns_s"),
     [({"reverse_every_s": 20.0}, [20.0, 40.0]), ({"calibrate_telemetry": True}, [15.0]), ({}, [])],

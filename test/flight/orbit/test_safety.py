@@ -1,3 +1,5 @@
+"""The room to stop in before the subject: own speed and chase count together."""
+
 import math
 
 import numpy as np
@@ -10,7 +12,7 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.bridge_config import SafetyConfig
 from drocap_ros.flight.conditions import ConditionCode, condition
-from drocap_ros.flight.orbit.motion_checks import battery_condition
+from drocap_ros.flight.orbit.motion_checks import battery_condition, stopping_room, subject_condition
 from drocap_ros.flight.orbit.safety import permit_mode, reduce, way_out
 from drocap_ros.flight.orbit.states import (
     Action,
@@ -272,14 +274,6 @@ def test_without_the_permission_to_change_the_mode_the_pilot_or_the_configuratio
     assert "mode_change_allowed" in way_out(Ready(), px4, mode_change_allowed=False)
 
 
-def test_where_the_speed_decides_the_words_of_a_near_subject_name_its_share():
-    near = changed(GOOD, subject_distance_m=7.1, closing_m_s=4.0)
-    words = str(reduce(orbiting(), near, 1.0, None, LIMITS)[0].condition)
-    room_m = float(words.split("the last ")[1].split(" m")[0])
-    assert "7.1 m away" in words
-    assert 7.1 - room_m < 3.0
-
-
 def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():
     limits = LIMITS._replace(warm_up_s=1.2)
     state, decision = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, limits)
@@ -290,6 +284,24 @@ def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():
     assert reduce(state, changed(LOITER, mode="LAND"), 1.0, None, limits)[0].state == State.TAKEN_OVER
     assert reduce(state, bad("gps", LOITER), 1.0, None, limits)[1].action == Action.NOTHING
     assert reduce(state, LOITER, 1.0, Command.STOP, limits)[1].action == Action.NOTHING
+
+
+@pytest.mark.parametrize("speed_m_s", [0.5, 2.0, 5.0])
+@pytest.mark.parametrize("granted_s", [0.2, 1.0, 4.0])
+def test_a_pending_engage_holds_the_vehicle_where_it_is_while_the_pilot_flies_on(speed_m_s, granted_s):
+    """The grant is seen late: until then what is sent must lead nowhere, least of all back or nearer."""
+    state, _ = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    for step in range(1, round(granted_s * 20)):
+        now_s = 0.05 * step
+        angle = speed_m_s * now_s / 6.0
+        about = np.array([6.0 * np.cos(angle), 6.0 * np.sin(angle), 2.5])
+        seen = changed(LOITER, position=about, yaw=0.1 * now_s)
+        state, decision = reduce(state, seen, now_s, None, LIMITS)
+        assert decision.action == Action.HOLD
+        np.testing.assert_array_equal(state.position, about)
+        assert state.yaw == 0.1 * now_s
+    nearer = changed(seen, subject_distance_m=2.0)
+    assert reduce(state, nearer, now_s + 0.05, None, LIMITS)[1].action == Action.NOTHING
 
 
 def test_disarming_ends_the_orbit_and_disabled_commands_are_refused():
@@ -484,3 +496,54 @@ def test_a_least_voltage_needs_a_known_one():
     assert battery_condition(0.9, math.nan, safety).code == ConditionCode.BATTERY_UNKNOWN
     assert battery_condition(math.nan, 15.0, safety) is None
     assert battery_condition(0.9, 13.9, safety).code == ConditionCode.BATTERY_LOW
+
+
+SAFETY = LIMITS.safety
+BRAKING = SAFETY.braking_m_s2
+
+
+def seen(distance_m=6.0, **values):
+    place = np.array([distance_m, 0.0, 2.5])
+    return changed(GOOD, position=place, subject_distance_m=distance_m, subject_sd_m=0.0, **values)
+
+
+def braking(speed):
+    return speed**2 / (2 * BRAKING)
+
+
+def test_own_speed_and_chase_count_together():
+    # The estimate recedes at 1 m/s and the vehicle closes at 2.5: the person may stand.
+    room = stopping_room(seen(closing_m_s=2.5, approach_m_s=-1.0), SAFETY)
+    assert room > braking(2.5) > braking(1.5) + braking(1.0)
+    assert room == pytest.approx(braking(2.5), abs=0.3)
+    # A vehicle that has fallen behind will follow at the speed of the chase.
+    assert stopping_room(seen(closing_m_s=0.0, approach_m_s=-1.4), SAFETY) > braking(1.4)
+    # A person who comes nearer walks on until the vehicle stands.
+    both = stopping_room(seen(closing_m_s=1.0, approach_m_s=1.0), SAFETY)
+    assert both > braking(1.0) + 1.0 * (0.5 + 1.0 / BRAKING)
+    assert stopping_room(seen(closing_m_s=-2.0), SAFETY) < 0.1
+
+
+def test_vehicle_that_flies_away_as_fast_as_the_person_comes_needs_no_room_for_his_steps():
+    # The vehicle followed him, and he turned: a hold would end the flight away from him.
+    away = stopping_room(seen(closing_m_s=-1.3, approach_m_s=1.3), SAFETY)
+    assert away < 0.2
+    gains = stopping_room(seen(closing_m_s=-0.5, approach_m_s=1.3), SAFETY)
+    assert gains >= away + 0.8 * 0.5
+    assert stopping_room(seen(closing_m_s=0.0, approach_m_s=1.3), SAFETY) >= 1.3 * 0.5
+
+
+def test_uncertainty_of_position_and_speeds_is_added():
+    calm = changed(seen(closing_m_s=1.0), subject_sd_m=0.4)
+    assert stopping_room(calm, SAFETY) >= braking(1.0) + 0.4
+    # Faster by a standard deviation than estimated, until the vehicle reacts.
+    unsure = changed(calm, approach_sd_m_s=0.6)
+    assert stopping_room(unsure, SAFETY) - stopping_room(calm, SAFETY) == pytest.approx(0.5 - 0.4)
+
+
+def test_orbit_ends_before_the_vehicle_cannot_stop_any_more():
+    # 2.4 m of room are needed at 2.5 m/s; two separate distances would have been 1.3 m.
+    near = seen(5.0, closing_m_s=2.5, approach_m_s=-1.0)
+    assert subject_condition(near, LIMITS).code == ConditionCode.SUBJECT_NEAR
+    assert reduce(orbiting(), near, 1.0, None, LIMITS)[0].state == State.HOLDING
+    assert subject_condition(seen(5.8, closing_m_s=2.5, approach_m_s=-1.0), LIMITS) is None

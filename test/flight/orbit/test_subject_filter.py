@@ -7,8 +7,7 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.bridge_config import SubjectConfig
 from drocap_ros.flight.subject.subject_filter import SubjectFilter
 from drocap_ros.flight.subject.subject_measurement import locate_subject
-from drocap_ros.flight.vehicle_filter import CameraPose, PoseHistory, VehicleFilter
-from drocap_ros.flight.vehicle_state import OPTICAL_FROM_FLU, VehicleState
+from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, CameraPose, PoseHistory, VehicleFilter, VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.capture import SimulationConfig, simulate_capture

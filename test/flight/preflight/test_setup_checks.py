@@ -9,7 +9,7 @@ import pytest
 from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.preflight.setup_checks import Setup, best_pitch_deg, person_in_picture, setup_findings
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix, project
 
 MATRIX = pinhole_matrix(1280, 720, 60.0)

@@ -105,32 +105,6 @@ def test_hold_that_dead_perception_began_stays(loop):
     assert all(row.action != Action.ORBIT for row in loop.rows[ended:])  # off by default
 
 
-@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-def test_orbit_resumes_after_a_short_hold_where_the_operator_allows_it(autopilot):
-    loop = orbit(autopilot, resume_after_hold_s=6.0)
-    blind(loop, 2.5)
-    assert loop.controller.safety.state == State.HOLDING
-    loop.run(loop.t + 1.5)
-    assert loop.controller.safety.state == State.ORBITING, loop.reasons[-3:]
-    assert {mode for _, mode, _ in loop.copter.mode_log if mode in ("BRAKE", "LOITER")} <= {"LOITER"}  # handed over
-    blind(loop, 9.0)
-    assert loop.copter.mode == ("BRAKE" if autopilot == "ardupilot" else "LOITER")
-    loop.run(loop.t + 4.0)
-    assert loop.controller.safety.state == State.HOLDING
-
-
-@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-@branched
-def test_starting_again_after_a_hold_is_one_command(loop, autopilot):
-    blind(loop, 6.0)
-    loop.run(loop.t + 2.0)
-    assert loop.controller.safety.state == State.HOLDING
-    assert loop.copter.mode == ("BRAKE" if autopilot == "ardupilot" else "LOITER")
-    loop.command(Command.ENGAGE)
-    loop.run(loop.t + 3.0)
-    assert loop.controller.safety.state == State.ORBITING, loop.reasons[-3:]
-
-
 @pytest.mark.parametrize("autopilot", ["ardupilot"])
 @branched
 def test_start_is_enough_when_the_pilot_gives_control_back_after_a_hold(loop):

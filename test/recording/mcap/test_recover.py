@@ -12,7 +12,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.recover import recover_session
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
-from drocap_ros.recording.mcap.stream import DamageKind
+from drocap_ros.recording.mcap.stream import DamageKind, McapStream
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session, session_info
 from drocap_ros.recording.session_tracks import read_pose2d
@@ -65,6 +65,26 @@ def test_damage_in_the_middle_loses_one_chunk_and_keeps_the_damaged_file(tmp_pat
     assert file.kept.read_bytes() == bytes(data)
     assert len(read_by_all(folder)["/drocap/pose2d"]) == file.messages
     assert len(read_pose2d(open_session(folder))) == file.messages
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_flipped_bits_lose_no_message_outside_the_chunks_that_they_hit(tmp_path, messages, capture, seed):
+    """One to three bits anywhere in the file: heads, lengths, declarations, chunks, indexes, summary."""
+    folder = tmp_path / "s"
+    write_poses(folder, messages, capture.tracks, SessionRecorderConfig(chunk_kib=16))
+    path, rng = folder / "s_0.mcap", random.Random(seed)
+    data = bytearray(path.read_bytes())
+    chunks = McapStream(path).summary().chunk_indexes
+    with open_session(folder) as session:
+        stamps = [raw.log_time_ns for raw in session.raw_messages()]
+    places = [rng.randrange(len(data)) if seed else chunks[0].chunk_start_offset + 200 for _ in range(1 + seed % 3)]
+    for place in places:
+        data[place] ^= 1 << rng.randrange(8)
+    path.write_bytes(data)
+    recover_session(folder)
+    hit = [c for c in chunks if any(0 <= p - c.chunk_start_offset < c.chunk_length for p in places)]
+    lost = set(stamps) - set(read_by_all(folder).get("/drocap/pose2d", []))
+    assert all(any(c.message_start_time <= stamp <= c.message_end_time for c in hit) for stamp in lost)
 
 
 def test_metadata_is_kept_and_the_description_is_rebuilt(tmp_path, messages, capture):

@@ -4,7 +4,7 @@ from angles import angle_between
 from telemetry_logs import dji_subtitle, heading_at, srt_text, turning_log, wrapped
 
 from drocap_ros.cli import main
-from drocap_ros.flight.vehicle_state import orientation_to_ros, quaternion_from_euler
+from drocap_ros.flight.vehicle import orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.motion import load_motion
 from drocap_ros.recording.telemetry.log import camera_poses

@@ -19,7 +19,7 @@ from telemetry_logs import mutated
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.flight.vehicle_state import OPTICAL_FROM_FLU
+from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.motion import load_motion
 from drocap_ros.recording.telemetry.djmd import read_djmd

@@ -13,7 +13,7 @@ from telemetry_logs import angles_of, dji_subtitle, mutated, srt_text, wrapped
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.flight.vehicle_state import ned_to_enu, orientation_to_aviation, quaternion_from_euler, yaw_of
+from drocap_ros.flight.vehicle import ned_to_enu, orientation_to_aviation, quaternion_from_euler, yaw_of
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.recording.telemetry.log import Lack, LogLack, camera_attitude, camera_poses

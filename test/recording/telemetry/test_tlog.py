@@ -6,7 +6,7 @@ import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
-from drocap_ros.flight.vehicle_state import quaternion_from_euler, yaw_of
+from drocap_ros.flight.vehicle import quaternion_from_euler, yaw_of
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.tlog import tlog_messages
 

@@ -1,7 +1,5 @@
 """The renderer: geometry, occlusion, light, and refused arguments."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -264,16 +262,3 @@ def test_invalid_arguments_are_refused_in_one_line():
     for matrix, width, height in ((-MATRIX, 64, 48), (MATRIX, 0, 48), (MATRIX, 64, 100_000), (MATRIX[:2], 64, 48)):
         with pytest.raises(InputError, match="expected"):
             Renderer(matrix, width, height, 0)
-
-
-def test_image_is_rendered_within_three_times_the_demo_bound():
-    """The bound of the demo is 12 ms; the factor of three allows for a shared machine."""
-    joints, rotation, position = orbit(count=12)
-    renderer = Renderer(MATRIX, 1280, 720, 0)
-    renderer.render(joints[0], rotation[0], position[0])
-    spent = []
-    for frame in range(12):
-        begin = time.process_time()
-        renderer.render(joints[frame], rotation[frame], position[frame])
-        spent.append(time.process_time() - begin)
-    assert np.median(spent) < 0.036

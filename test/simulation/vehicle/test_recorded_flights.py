@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
-from drocap_ros.simulation.vehicle.dynamics import Body
+from drocap_ros.simulation.vehicle.copter_reports import Body
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target, control_of
 from lab.flights.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
 

@@ -2,8 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from drocap_ros.flight.vehicle_filter import VehicleFilter
+from drocap_ros.flight import vehicle
+from drocap_ros.flight.vehicle import PoseHistory, VehicleFilter, VehicleState
+from drocap_ros.geometry.geodesy import enu_to_geodetic, geodetic_to_enu
+from drocap_ros.geometry.rotations import quaternion_multiply
 
 
 def filtered(times, positions, velocities, sd_m_s=0.1):
@@ -143,3 +147,112 @@ def test_no_recorded_flight_contradicts_itself(shared):
         assert not any(any(doubt) for doubt in doubts), name
         judged += len(doubts)
     assert judged > 10000
+
+
+RNG = np.random.default_rng(7)
+V = RNG.normal(size=(50, 3))
+Q = Rotation.random(50, random_state=3).as_quat()
+
+
+def test_axes_are_swapped_and_negated():
+    north, east, down = np.eye(3)
+    assert np.array_equal(vehicle.ned_to_enu(north), [0, 1, 0])
+    assert np.array_equal(vehicle.ned_to_enu(east), [1, 0, 0])
+    assert np.array_equal(vehicle.ned_to_enu(down), [0, 0, -1])
+    assert np.array_equal(vehicle.frd_to_flu(np.array([1.0, 2.0, 3.0])), [1, -2, -3])
+
+
+def test_conversion_is_its_own_inverse():
+    assert np.array_equal(vehicle.enu_to_ned(vehicle.ned_to_enu(V)), V)
+    assert np.array_equal(vehicle.flu_to_frd(vehicle.frd_to_flu(V)), V)
+    back = vehicle.orientation_to_aviation(vehicle.orientation_to_ros(Q))
+    assert np.allclose(np.abs(np.sum(back * Q, axis=1)), 1.0)
+
+
+def test_orientation_agrees_with_converted_vectors():
+    # body FLU -> ENU must equal: FLU to FRD, then FRD -> NED, then NED to ENU.
+    ros = Rotation.from_quat(vehicle.orientation_to_ros(Q)).apply(V)
+    chain = vehicle.ned_to_enu(Rotation.from_quat(Q).apply(vehicle.flu_to_frd(V)))
+    assert np.allclose(ros, chain)
+
+
+def test_vehicle_that_points_north_has_enu_yaw_of_90_degrees():
+    q = vehicle.orientation_to_ros(vehicle.quaternion_from_euler(0, 0, 0))
+    assert np.allclose(Rotation.from_quat(q).as_euler("ZYX", degrees=True), [90, 0, 0])
+    q = vehicle.orientation_to_ros(vehicle.quaternion_from_euler(0, 0, np.pi / 2))  # nose east
+    assert np.allclose(Rotation.from_quat(q).apply([1, 0, 0]), [1, 0, 0])
+    q = vehicle.orientation_to_ros(vehicle.quaternion_from_euler(0, np.pi / 6, 0))  # nose up
+    assert Rotation.from_quat(q).apply([1, 0, 0])[2] > 0.49
+    q = vehicle.orientation_to_ros(vehicle.quaternion_from_euler(np.pi / 6, 0, 0))  # right wing down
+    assert Rotation.from_quat(q).apply([0, 1, 0])[2] > 0.49
+
+
+def test_euler_angles_and_product_equal_scipy():
+    angles = RNG.uniform(-1.5, 1.5, (30, 3))
+    for roll, pitch, yaw in angles:
+        ours = vehicle.quaternion_from_euler(roll, pitch, yaw)
+        theirs = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_quat()
+        assert np.isclose(abs(ours @ theirs), 1.0)
+        assert np.isclose(vehicle.yaw_of(ours), yaw)
+    one_by_one = [vehicle.quaternion_from_euler(*row) for row in angles]
+    np.testing.assert_allclose(vehicle.quaternion_from_euler(*angles.T).T, one_by_one, atol=1e-15)
+    ours = quaternion_multiply(Q, Q[::-1])
+    theirs = (Rotation.from_quat(Q) * Rotation.from_quat(Q[::-1])).as_quat()
+    assert np.allclose(np.abs(np.sum(ours * theirs, axis=1)), 1.0)
+
+
+def test_camera_rotation_of_a_level_camera_facing_north():
+    q = vehicle.orientation_to_ros(vehicle.quaternion_from_euler(0, 0, 0))
+    rotation = vehicle.camera_rotation(q)
+    assert np.allclose(rotation @ [0, 1, 0], [0, 0, 1])  # north is ahead
+    assert np.allclose(rotation @ [1, 0, 0], [1, 0, 0])  # east is right
+    assert np.allclose(rotation @ [0, 0, 1], [0, -1, 0])  # up is minus y
+    assert vehicle.camera_rotation(Q).shape == (50, 3, 3)
+    assert np.allclose(np.linalg.det(vehicle.camera_rotation(Q)), 1.0)
+
+
+@pytest.mark.parametrize("origin", [(47.4, 8.5, 488.0), (0.0, 0.0, 0.0), (-33.9, 151.2, 20.0), (89.99, 10.0, 5.0)])
+def test_geodetic_conversion_is_inverted(origin):
+    origin = np.array(origin)
+    enu = RNG.uniform(-2000, 2000, (40, 3))
+    geodetic = enu_to_geodetic(enu, origin)
+    assert np.allclose(geodetic_to_enu(geodetic, origin), enu, atol=1e-5)
+
+
+def test_geodetic_offsets_have_the_known_scale():
+    # A minute of latitude is one nautical mile, to within its variation with latitude.
+    enu = geodetic_to_enu(np.array([45.0 + 1 / 60, 7.0, 0.0]), np.array([45.0, 7.0, 0.0]))
+    assert np.isclose(enu[1], 1852, atol=2)
+    assert abs(enu[0]) < 1e-6
+    up = geodetic_to_enu(np.array([45.0, 7.0, 30.0]), np.array([45.0, 7.0, 0.0]))
+    assert np.allclose(up, [0, 0, 30])
+
+
+S = 1_000_000_000
+
+
+def state(t_s, yaw_deg=0.0, **kwargs):
+    half = np.deg2rad(yaw_deg) / 2
+    return VehicleState(
+        int(t_s * S), position_enu_m=np.array([t_s, 0.0, 2.0]), velocity_enu_m_s=np.array([1.0, 0.0, 0.0]),
+        gimbal_orientation_xyzw=np.array([0.0, 0.0, np.sin(half), np.cos(half)]), **kwargs,
+    )  # fmt: skip
+
+
+def test_pose_is_interpolated_and_never_extrapolated():
+    history = PoseHistory()
+    assert history.at(S) is None
+    for i in range(20):
+        seen = state(1 + 0.1 * i, 3.0 * i)
+        history.add(seen, seen.position_enu_m)
+    middle = history.at(int(1.55 * S))
+    assert np.allclose(middle.position, [1.55, 0, 2])
+    yaw = np.deg2rad(16.5)
+    assert np.allclose(middle.rotation[2], [np.cos(yaw), np.sin(yaw), 0])
+    assert history.reached(int(2.9 * S))
+    assert history.at(int(2.9 * S)) is not None
+    for outside_s in (0.5, 2.95, 3.3):
+        assert history.at(int(outside_s * S)) is None
+    assert not history.reached(int(2.95 * S))
+    history.add(state(0.2), np.zeros(3))  # the clock went back
+    assert history.at(int(1.5 * S)) is None

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS, PacketOrder
 from drocap_ros.flight.mavlink.parser import CurrentMode, MavlinkParser
+from drocap_ros.flight.mavlink.reports import MAX_LOSS, PacketOrder
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 
 S = 1_000_000_000
@@ -99,30 +99,6 @@ def test_a_mode_is_not_fresh_where_many_packets_are_lost():
 
 def test_before_the_first_heartbeat_a_number_has_no_name():
     assert read(packets([current_mode("OFFBOARD")])).mode == ""
-
-
-def test_a_late_report_of_the_mode_before_is_no_news():
-    before, change, after = packets([heartbeat("LOITER"), heartbeat("LOITER"), current_mode("OFFBOARD")])
-    modes = read([before, after])
-    modes.take_heard()
-    estimator = VehicleStateEstimator()
-    for message in (before, after):
-        estimator.update(message, S)
-    estimator.modes.take_heard()
-    estimator.update(change, S + 1)
-    assert (estimator.modes.mode, estimator.modes.take_heard()) == ("OFFBOARD", frozenset())
-
-
-def test_a_late_report_of_a_mode_in_between_is_heard():
-    estimator = VehicleStateEstimator()
-    first, between, last = packets([heartbeat("OFFBOARD"), current_mode("RTL"), current_mode("OFFBOARD")])
-    for message in (first, last):
-        estimator.update(message, S)
-    estimator.modes.take_heard()
-    age_s = estimator.modes.age_s(2 * S)
-    estimator.update(between, S + 10)
-    assert (estimator.modes.mode, estimator.modes.take_heard()) == ("OFFBOARD", {"RTL"})
-    assert estimator.modes.age_s(2 * S) == age_s
 
 
 @given(
