@@ -33,7 +33,7 @@ BUDGETS = {
     # evidence, lens, shoulders, a camera (0.05); numbers of persons in a part (0.02);
     # inputs of several recordings (0.05); everybody in the pictures (0.25); single quaternions by Python's numbers,
     # which takes an eighth from every simulated flight (0.05)
-    ("perception",): 6.65,  # points of the scene; one who is followed live, and everybody in a recording
+    ("perception",): 6.60,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 13.69,  # 4.22 over the plan: world/ and live/ kept their steps; one constant a line;
     # with reasons; camera/, paths by fixed points of the scene (1.25), without telemetry, with up and metres (1.20);
     # the view of a camera that looks at the person, assumed lenses, evidence of depth (0.32), in live windows (0.05);

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.recording.mcap import metadata as bag
+from drocap_ros.recording.mcap.file import McapFile
 from drocap_ros.recording.mcap.metadata import METADATA_FILE, METADATA_RECORD, FileRecord, TopicRecord, Yaml, type_hash
-from drocap_ros.recording.mcap.recover import McapFile
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 
 #: MCAP's times are unsigned nanoseconds of 64 bits.

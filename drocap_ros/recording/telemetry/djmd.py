@@ -65,15 +65,7 @@ def has_djmd(path: Path) -> bool:
 
 
 def read_djmd(path: Path) -> TelemetryLog:
-    """Gimbal and aircraft attitude, position and lens of every image, by the video's own clock.
-
-    Raises
-    ------
-    InputError
-        When there is no such track, or its content is damaged or cannot be true.
-    OSError
-        When the file cannot be read.
-    """
+    """Gimbal and aircraft attitude, position and lens of every image, by the video's own clock."""
     found = find_track(path, (_FORMAT, *TEXT_TRACKS))
     if found is None:
         raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
