@@ -100,7 +100,7 @@ def _poses(path: Path) -> int | None:
 
 
 def _log(path: Path) -> None:
-    from drocap_ros.recording.telemetry.camera_poses import camera_poses
+    from drocap_ros.recording.telemetry.log import camera_poses
     from drocap_ros.recording.telemetry.read import read_telemetry
 
     log = read_telemetry(path)

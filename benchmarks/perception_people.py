@@ -28,7 +28,7 @@ from people_scenes import SCENES, PeopleScene, camera_of, images_of, of_another,
 from drocap_ros.evaluation.metrics import pa_mpjpe  # noqa: E402
 from drocap_ros.perception.people import PeopleEstimator, observe_people  # noqa: E402
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig  # noqa: E402
-from drocap_ros.reconstruction.shared_camera import reconstruct_people  # noqa: E402
+from drocap_ros.reconstruction.people import reconstruct_people  # noqa: E402
 from drocap_ros.tracks import Tracks  # noqa: E402
 
 MODELS = ROOT.parent / "shared" / "models"

@@ -24,34 +24,15 @@ ROS_ROOMS = {"ros", "nodes", "bringup"}
 ROS_PACKAGES = ("rclpy", "drocap_ros.msg", "drocap_ros.srv")
 MAX_LINES = 450
 #: Most lines of Python per room, in thousands: what there was, up to the next 50.  A feature pays for its lines by what
-#: it makes needless; who raises a budget writes the reason beside the number.  The plan is issue 45's.
+#: it makes needless; who raises a budget writes the reason beside the number.
 BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
      "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "live_replay"): 3.85,  # points of the scene, everybody in the pictures
-    ("perception",): 7.45,  # 2.25 over the plan: tracking keeps its own association; foreign pictures and streams came;
-    # points of the scene (0.35); networks of TensorFlow Lite, which registries hold, become ONNX (0.43); files of
-    # wheels, which came from `cli` (0.07), feet and joints in space by a second network (0.13); steps of an image
-    # beside each other (0.10); everybody in one pass: bodies from image to image, whose each joint is (0.75);
-    # points of an hour (0.02); persons beside a live subject, each in a place (0.29)
-    ("reconstruction",): 13.69,  # 4.22 over the plan: world/ and live/ kept their steps; one constant a line;
-    # with reasons; camera/, paths by fixed points of the scene (1.25), without telemetry, with up and metres (1.20);
-    # the view of a camera that looks at the person, assumed lenses, evidence of depth (0.32), in live windows (0.05);
-    # one camera for several persons (0.30); live windows by points, their calibration carried on, as a chain (0.30);
-    # starts of a path that a wrong lens turns inside out (0.03);
-    # drawn toes apart, size and lean in the covariance (0.05); several recordings of one person (1.00);
-    # live windows without telemetry in `odom` (0.35); covariances of the mean place (0.10); forecast of views (0.10)
-    # a path goes on over the ground where a camera hovers, robust steps place it (0.22);
-    # which single error of the telemetry points contradict (0.12), another flight (0.04); a camera
-    # that moves as the body turns in its pictures (0.06); cuts, shots between them and the motion over them (0.21);
-    # a live path takes over metres and up of later windows (0.08); deviations of a path about the best similarity
-    # (0.06), and the person goes on from a path to the next one (0.05);
-    # lean by balance (0.13)
+    ("perception",): 6.60,  # points of the scene; one who is followed live, and everybody in a recording
+    ("reconstruction",): 12.65,  # one engine and one camera; paths by fixed points, several recordings, live windows
     ("flight",): 9.35,  # a process that holds after the bridge's death; conditions with their values; preflight
-    ("recording",): 5.70,  # 1.16 over the plan: every format of telemetry stayed; keypoints of other tools came (0.38)
-    # and 3D poses of theirs (0.11); subtitles beside a video, units of flight logs (0.04);
-    # bags without an index (0.12); points as the live graph had them (0.04);
-    # topics of persons beside the subject (0.01)
+    ("recording",): 5.30,  # every format of telemetry and of keypoints stayed; damaged and foreign recordings
     ("simulation",): 3.55,  # reports err as recorded ones
     ("evaluation",): 1.0,  # truth from C3D, TRC and BVH by the names of other programs (0.34)
     ("export", "report", "view"): 4.30,  # exports for OpenSim, a report of several persons, the video beside the body

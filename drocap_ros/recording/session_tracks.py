@@ -14,8 +14,7 @@ from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording import session as recorded
 from drocap_ros.recording.pose_messages import float_array, read_fixed_points
 from drocap_ros.recording.session import Message, Session, TopicInfo, calibration_of, header_stamp_ns, xyzw_of
-from drocap_ros.recording.telemetry.camera_poses import with_camera
-from drocap_ros.recording.telemetry.log import VehicleTrack
+from drocap_ros.recording.telemetry.log import VehicleTrack, with_camera
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
@@ -31,7 +30,7 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
     """Tracks of the subject in most images, keypoints exactly as in the recorded messages.
 
     Images without that subject are frames of NaN.  The tracks contain the camera's poses where the recording does, see
-    :func:`drocap_ros.recording.telemetry.camera_poses.camera_poses`.  Missing parts are in ``session.warnings``.
+    :func:`drocap_ros.recording.telemetry.log.camera_poses`.  Missing parts are in ``session.warnings``.
 
     mount_pitch_deg : of a camera fixed to the body, negative down, for recordings without the camera's attitude
     telemetry : whether the states of the vehicle are used

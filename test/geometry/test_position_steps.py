@@ -9,8 +9,7 @@ from walking import make_walk, stamps
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.geometry.interpolation import fill_frames, usual_step, without_steps
-from drocap_ros.recording.telemetry.camera_poses import camera_poses
-from drocap_ros.recording.telemetry.log import VehicleTrack
+from drocap_ros.recording.telemetry.log import VehicleTrack, camera_poses
 
 FPS = 30.0
 STAMPS = np.round(np.arange(360) * 1e9 / FPS).astype(np.int64)

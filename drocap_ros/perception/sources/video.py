@@ -34,6 +34,8 @@ _TAIL_FRAMES = 2
 #: Pixels of other shapes are not believed.
 _MAX_ASPECT = 4
 _NS = 10**9
+#: Bounds against damaged files: boxes at one level, and the bytes of an index of hours.
+_MAX_BOXES, _MAX_INDEX = 4096, 1 << 26
 #: Codecs of messages' packets by their names there.
 _CODECS = {r"[hx]\.?264|avc": "h264", r"[hx]\.?265|hevc": "hevc", "vp9": "vp9", "av1": "av1", "mjpe?g": "mjpeg"}
 
@@ -250,7 +252,7 @@ class VideoSource(ImageSource):
             self._tell(SourceEventKind.ENDED_EARLY, f"cut off or damaged, {decoded}")
         elif damaged := self._decoder.damaged:
             near = next((f" near {time_s:.1f} s" for time_s in damaged if time_s is not None), "")
-            self._tell(SourceEventKind.DAMAGED, f"{len(damaged)} packets do not decode{near}, {decoded}")
+            self._tell(SourceEventKind.DAMAGED, f"packets that do not decode: {len(damaged)}{near}; {decoded}")
         for event in self._events[before:]:
             log.warning(str(event))
 
@@ -290,10 +292,6 @@ def track_codes(path: Path) -> list[str]:
             if size < 8 or (place := place + size) >= end:
                 break
     return []
-
-
-#: Bounds against damaged files: boxes at one level, and the bytes of an index of hours.
-_MAX_BOXES, _MAX_INDEX = 4096, 1 << 26
 
 
 def decoded_packets(codec: str, packets: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, np.ndarray]]:

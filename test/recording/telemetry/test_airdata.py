@@ -13,7 +13,7 @@ from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.recording.telemetry.read import read_telemetry
-from drocap_ros.recording.telemetry.time_offset import OffsetSource, find_offset
+from drocap_ros.recording.video_telemetry import OffsetSource, find_offset
 
 
 @pytest.mark.parametrize("unit", ["feet", "meters"])

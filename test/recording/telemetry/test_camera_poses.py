@@ -7,7 +7,7 @@ from drocap_ros.cli import main
 from drocap_ros.flight.vehicle import orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.motion import load_motion
-from drocap_ros.recording.telemetry.camera_poses import camera_poses
+from drocap_ros.recording.telemetry.log import camera_poses
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.tracks import save_tracks
 

@@ -22,9 +22,8 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.motion import load_motion
-from drocap_ros.recording.telemetry.camera_poses import camera_poses
 from drocap_ros.recording.telemetry.djmd import read_djmd
-from drocap_ros.recording.telemetry.log import Lack, LogLack
+from drocap_ros.recording.telemetry.log import Lack, LogLack, camera_poses
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.tracks import Tracks, load_tracks

@@ -16,10 +16,9 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle import ned_to_enu, orientation_to_aviation, quaternion_from_euler, yaw_of
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.geometry.rotations import matrix_from_quaternion
-from drocap_ros.recording.telemetry.camera_poses import camera_attitude, camera_poses
-from drocap_ros.recording.telemetry.log import Lack, LogLack
+from drocap_ros.recording.telemetry.log import Lack, LogLack, camera_attitude, camera_poses
 from drocap_ros.recording.telemetry.read import read_telemetry
-from drocap_ros.recording.telemetry.time_offset import find_offset
+from drocap_ros.recording.video_telemetry import find_offset
 
 
 def test_tlog_states_equal_what_pymavlink_reads(shared):

@@ -6,8 +6,8 @@ import pytest
 from telemetry_logs import heading_at, turning_log, turning_video
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.telemetry.time_offset import OffsetSource, find_offset, image_motion
 from drocap_ros.recording.telemetry.video_tracks import stated_times
+from drocap_ros.recording.video_telemetry import OffsetSource, find_offset, image_motion
 
 
 def test_offset_is_estimated_from_the_cameras_turning(tmp_path):
