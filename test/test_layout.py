@@ -51,16 +51,16 @@ BUDGETS = {
     # a live path takes over metres and up of later windows (0.08); deviations of a path about the best similarity
     # (0.06), and the person goes on from a path to the next one (0.05);
     # lean by balance (0.13)
-    ("flight",): 9.35,  # a process that holds after the bridge's death; conditions with their values; preflight
+    ("flight",): 9.15,  # a process that holds after the bridge's death; conditions with their values; preflight
     ("recording",): 5.70,  # 1.16 over the plan: every format of telemetry stayed; keypoints of other tools came (0.38)
     # and 3D poses of theirs (0.11); subtitles beside a video, units of flight logs (0.04);
     # bags without an index (0.12); points as the live graph had them (0.04);
     # topics of persons beside the subject (0.01)
-    ("simulation",): 3.55,  # reports err as recorded ones
+    ("simulation",): 3.45,  # reports err as recorded ones
     ("evaluation",): 1.0,  # truth from C3D, TRC and BVH by the names of other programs (0.34)
-    ("export", "report", "view"): 4.40,  # exports for OpenSim, a report of several persons, the video beside the body
-    ("ros", "nodes", "bringup"): 4.65,  # lockstep and processes of their own
-    ("cli",): 4.65,  # batch, preflight and top stayed whole
+    ("export", "report", "view"): 4.30,  # exports for OpenSim, a report of several persons, the video beside the body
+    ("ros", "nodes", "bringup"): 4.60,  # lockstep and processes of their own
+    ("cli",): 4.60,  # batch, preflight and top stayed whole
     ("lab", "benchmarks"): 11.10,  # studies, replay of reports, faults of flights, damaged files of every reader
 }  # fmt: skip
 #: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.
