@@ -24,10 +24,10 @@ from figures import ROOT, table, write_figures
 from drocap_ros.perception.detection.detector import Detector
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import load_detector, load_pose_model
-from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.runtime import network_files, open_model
 from drocap_ros.perception.models.spec import read_spec
+from drocap_ros.perception.pose.body_pose import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints, PoseModel
-from drocap_ros.perception.pose.uncertainty import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.sources.image_files import read_image
 from drocap_ros.perception.track_video import observe, subjects
@@ -80,8 +80,8 @@ def speed(repetitions: int) -> str:
 
     image = read_image(MEDIA / "skier.jpg")
     box = np.array([280.0, 44, 500, 392])
-    for path in sorted(MODELS.glob("*.onnx")):
-        model = OnnxModel(path)
+    for path in network_files(MODELS):
+        model = open_model(path)
         spec = read_spec(model)
         width, height = spec.input_size
         shape = (1, height, width, 3) if spec.channels_last else (1, 3, height, width)

@@ -19,7 +19,7 @@ from typing import get_type_hints
 from drocap_ros.errors import InputError, ParameterError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.parameters import Parameters, Values
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.recording.mcap.session_config import SessionPlayerConfig, SessionRecorderConfig

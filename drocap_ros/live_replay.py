@@ -21,9 +21,14 @@ from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort
 from drocap_ros.recording.open_session import is_recording, open_session
-from drocap_ros.recording.pose_messages import read_observations
+from drocap_ros.recording.pose_messages import (
+    Agreement,
+    PublishedPoses,
+    RecordedCamera,
+    RecordedPoints,
+    read_observations,
+)
 from drocap_ros.recording.provenance import CONFIGURATION
-from drocap_ros.recording.published_poses import Agreement, PublishedPoses, RecordedCamera, RecordedPoints
 from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.recording.session_tracks import most_frequent_subject
 from drocap_ros.skeleton import BODY_17

@@ -12,7 +12,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources import Frame, open_source
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.recording.image_messages import choose_images, read_images
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.telemetry.read import LOG_SUFFIXES

@@ -21,7 +21,7 @@ from drocap_ros.open_images import open_images, refuse_other_inputs
 from drocap_ros.parameters import Values
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.persons import FoundPerson, find_persons, following, in_view
+from drocap_ros.perception.people import FoundPerson, find_persons, following, in_view
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
@@ -46,7 +46,7 @@ logger = logging.getLogger(__name__)
 class Selection:
     """Part of an input that is reconstructed.
 
-    person : number of a person of :func:`~drocap_ros.perception.persons.find_persons`; None = as configured
+    person : number of a person of :func:`~drocap_ros.perception.people.find_persons`; None = as configured
     redetect : estimate the 2D poses of a recording from its images, although it holds recorded ones
     topic : of the images of a recording; empty: colour before grey, then that with most messages
     rate_hz : true rate of the images where a video plays them slower

@@ -13,7 +13,7 @@ from drocap_ros.errors import DrocapError, InputError
 
 if TYPE_CHECKING:
     from drocap_ros.observation import PoseObservation
-    from drocap_ros.perception.models.registry import KnownModel
+    from drocap_ros.perception.models.fetch import KnownModel
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -35,9 +35,12 @@ def add_parser(subparsers: Subparsers) -> None:
             "--models",
             metavar="DIR",
             type=Path,
-            help="folder of ONNX models, or 'simulation' for the shipped ones for rendered images (default:"
+            help="folder of networks, or 'simulation' for the shipped ones for rendered images (default:"
             " $DROCAP_MODELS)",
         )
+    actions.choices["list"].add_argument(
+        "--write", action="store_true", help="write NAME.yaml beside each unknown network, to fill in what it is"
+    )
     fetching, checking = actions.choices["fetch"], actions.choices["check"]
     fetching.add_argument("names", nargs="*", metavar="NAME", help="models by name (default: rtmdet-nano rtmpose-s)")
     add_quiet_option(fetching)
@@ -50,12 +53,16 @@ def add_parser(subparsers: Subparsers) -> None:
 def run_list(args: argparse.Namespace) -> int:
     """Print the registry and the files of the folder."""
     from drocap_ros.perception.load_models import SIMULATION, models_folder
-    from drocap_ros.perception.models.registry import KNOWN_MODELS
+    from drocap_ros.perception.models.fetch import KNOWN_MODELS
+    from drocap_ros.perception.models.runtime import network_files
+    from drocap_ros.perception.models.spec import write_specs
 
     folder, shipped = models_folder(args.models), models_folder(SIMULATION)
     if args.models and not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of models, found no such folder; check the path")
-    present = sorted(folder.glob("*.onnx"))
+    for path in write_specs(folder) if args.write else ():
+        print(f"written: {path}; fill in its layout")
+    present = network_files(folder)
     names = {path.name for path in present}
     head = ("NAME", "TASK", "MB", "LICENCE", "TRAINED ON", "FROM", "FILE", "INSTALLED")
     print("\n".join(table_lines([head, *(_row(model, model.file in names) for model in KNOWN_MODELS)])))
@@ -63,12 +70,12 @@ def run_list(args: argparse.Namespace) -> int:
     print("".join(f"  {describe(path)}\n" for path in present), end="")
     if folder != shipped:
         print(f"\nshipped, used only with `--models {SIMULATION}`:")
-        print("".join(f"  {describe(path)}\n" for path in sorted(shipped.glob("*.onnx"))), end="")
+        print("".join(f"  {describe(path)}\n" for path in network_files(shipped)), end="")
     return 0
 
 
 def _row(model: KnownModel, installed: bool) -> tuple[str, ...]:
-    origin = model.home if model.offered else f"{model.home} (no ONNX download)"
+    origin = model.home if model.offered else f"{model.home} (no download)"
     facts = (model.name, model.task, f"{model.size_mb:.1f}", model.licence, model.training_data, origin, model.file)
     return (*facts, "yes" if installed else "-")
 
@@ -76,12 +83,12 @@ def _row(model: KnownModel, installed: bool) -> tuple[str, ...]:
 def describe(path: Path) -> str:
     """One line on a model file: its layout and input, or the reason why it cannot be used."""
     from drocap_ros.perception.load_models import limited_use
-    from drocap_ros.perception.models.runtime import OnnxModel
+    from drocap_ros.perception.models.runtime import open_model
     from drocap_ros.perception.models.spec import read_spec
 
     size = path.stat().st_size / 1e6
     try:
-        model = OnnxModel(path)
+        model = open_model(path)
         spec = read_spec(model)
     except InputError as error:
         return f"{path.name}  {size:.1f} MB  cannot be used: {error}"
@@ -95,7 +102,7 @@ def describe(path: Path) -> str:
 def run_fetch(args: argparse.Namespace) -> int:
     """Download the named models."""
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, known_model
+    from drocap_ros.perception.models.fetch import DEFAULT_FETCH, KNOWN_MODELS, known_model
 
     chosen = []
     for name in args.names or DEFAULT_FETCH:
@@ -154,9 +161,10 @@ def ensure_networks(folder: Path, source: str | Path, args: argparse.Namespace) 
     It needs ``--fetch``, or a yes at the terminal.
     """
     from drocap_ros.open_images import open_images
-    from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, known_model
+    from drocap_ros.perception.models.fetch import DEFAULT_FETCH, KNOWN_MODELS, known_model
+    from drocap_ros.perception.models.runtime import network_files
 
-    names = () if any(folder.glob("*.onnx")) else DEFAULT_FETCH
+    names = () if network_files(folder) else DEFAULT_FETCH
     feet = known_model(args.feet) if args.feet else None
     if feet and not (folder / feet.file).is_file():
         names = (*names, feet.name)
@@ -187,8 +195,7 @@ def _agreed(lack: str, pair: str) -> bool:
 def fetch_models(models: Sequence[KnownModel], folder: Path, *, quiet: bool = False) -> list[str]:
     """Download models and print one line for each; returns the failures of network or server."""
     from drocap_ros.cli.running import progress_bars
-    from drocap_ros.perception.models.fetch import fetch
-    from drocap_ros.perception.models.wheel import FetchError
+    from drocap_ros.perception.models.fetch import FetchError, fetch
 
     errors = []
     with progress_bars(quiet) as progress:

@@ -78,7 +78,7 @@ def add_config_option(parser: argparse.ArgumentParser, *, required: bool = False
 
 def add_models_option(parser: argparse.ArgumentParser) -> None:
     """Add ``--models``."""
-    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of networks (default: $DROCAP_MODELS)")
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:

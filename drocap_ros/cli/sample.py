@@ -10,8 +10,7 @@ from drocap_ros.cli import reconstruct
 from drocap_ros.cli.models import fetch_models
 from drocap_ros.cli.options import LineParser, Subparsers, add_command, add_quiet_option
 from drocap_ros.errors import DrocapError
-from drocap_ros.perception.models.registry import known_model
-from drocap_ros.perception.models.wheel import Package, fetch_member
+from drocap_ros.perception.models.fetch import Package, fetch_member, known_model
 
 #: The demo video of Sports2D (David Pagnon and others).
 CLIP = Package("sports2d==0.8.34", "733b6db70742636ae9c35d870c22bd416582f579abd5881bee93a14bb0e2655d")
@@ -36,7 +35,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fetch, convert, reconstruct."""
+    """Fetch and reconstruct."""
     from drocap_ros.cli.atomic_output import check_output_folder
 
     check_output_folder(args.out)

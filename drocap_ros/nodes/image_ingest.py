@@ -24,9 +24,8 @@ from std_msgs.msg import Header
 from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.perception.calibration import CameraModel, camera_model
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
-from drocap_ros.perception.sources.base import prefetch
+from drocap_ros.perception.sources.base import ImageIngestConfig, prefetch
 from drocap_ros.perception.sources.image_files import encode_jpeg
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import ERROR, OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at, stamp_from_ros

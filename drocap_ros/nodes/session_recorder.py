@@ -22,7 +22,7 @@ from sensor_msgs.msg import CameraInfo
 from drocap_ros.errors import InputError
 from drocap_ros.parameters import Values
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.provenance import (

@@ -9,14 +9,10 @@ import numpy as np
 
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.detection.nms import overlap_coefficient
-from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
-from drocap_ros.perception.pose.feet import FeetModel
-from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.tracking.appearance import describe
-from drocap_ros.perception.tracking.body_track import BodyTrack
-from drocap_ros.perception.tracking.identity import FORGET_S, found_again
-from drocap_ros.perception.tracking.limb_colours import limb_colours
-from drocap_ros.perception.tracking.own_joints import Poses, own_joints
+from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel, FeetModel
+from drocap_ros.perception.tracking.appearance import describe, limb_colours
+from drocap_ros.perception.tracking.association import FORGET_S, found_again
+from drocap_ros.perception.tracking.own_joints import BodyTrack, Poses, own_joints
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import BODY_15, BODY_19
@@ -26,8 +22,7 @@ _UNDETECTED_S = 3.0  # time without a detection over which doubtful poses are a 
 _OVERLAP = 0.02  # overlap coefficient of two boxes from which joints may be the other's
 _LEAST_BESIDE = 0.6  # confidence of a joint in another's box, too: of the own ones 5 % have less, of others' the half
 _LEAST_JOINTS = 4  # of BODY_15 that show a person
-_SAME_BODY = 0.1  # median distance of two poses' joints, lengths, below which they are one person's,
-_OTHER_BODY = 0.5  # and from which they are not: in a hug they are nearer
+_SAME_BODY = 0.1  # median distance of two poses' joints, lengths, below which they are one person's
 
 
 @dataclass(eq=False)
@@ -46,29 +41,20 @@ class Bodies:
     """Follows persons through the images of one camera; equal images give equal results.
 
     model, feet : the pose network, and the second one for feet or None
-    most : greatest number of persons beside the subject; None = all
     threads : that share the work on an image; the results are the same with any number
 
     Attributes
     ----------
     people, gone : those who are followed; those who left the image or were hidden for long
-    subject : the one of them whose joints another estimator gives; None = nobody
     """
 
     def __init__(
-        self,
-        model: BodyPoseModel,
-        feet: FeetModel | None,
-        config: PoseEstimatorConfig,
-        most: int | None = None,
-        threads: int = 2,
+        self, model: BodyPoseModel, feet: FeetModel | None, config: PoseEstimatorConfig, threads: int = 2
     ) -> None:
-        self._model, self._feet, self._config, self._most = model, feet, config, most
+        self._model, self._feet, self._config = model, feet, config
         self.pool = ThreadPoolExecutor(threads, thread_name_prefix="people")
         self.people: list[Body] = []
         self.gone: list[Body] = []
-        self.subject: Body | None = None
-        self._given: PoseObservation | None = None
         self._size = (0, 0)
 
     def predict(self, stamp_ns: int, motion: np.ndarray | None) -> None:
@@ -78,87 +64,24 @@ class Bodies:
                 one.track.move_camera(motion)
             one.track.predict(stamp_ns)
 
-    def give(self, image: np.ndarray, given: PoseObservation | None, *, another: bool) -> None:
-        """The subject's joints in the next image, from another estimator; None = it does not see them.
-
-        another : whether the subject is another person than before
-        """
-        self._given = given
-        if another:
-            self.subject = None
-        if given is None:
-            return
-        near = min(self.people, key=lambda one: self._apart(one, given), default=None)
-        here = near if near is not None and self._apart(near, given) < _SAME_BODY else None
-        if self.subject is None:
-            self.subject = here or self._new_subject(image, given)
-        elif self.subject not in self.people or self._apart(self.subject, given) > _OTHER_BODY:
-            # Found again by the other estimator: whoever is followed there was this person.
-            if here is not None:
-                self.people.remove(here)
-            self.subject.track.continue_as(self._new_subject(image, given).track)
-        self.people += [self.subject] if self.subject not in self.people else []
-        self.gone = [one for one in self.gone if one is not self.subject]
-
-    def _new_subject(self, image: np.ndarray, given: PoseObservation) -> Body:
-        box = given.roi.astype(float)
-        person = Person(box, given.detection_score, given.stamp_ns, describe(image, box))
-        pose = self._given_pose((box[:2] + box[2:]) / 2)
-        return Body(BodyTrack(person, pose, self._model.joint_map.joints, given.stamp_ns))
-
-    def _apart(self, one: Body, given: PoseObservation) -> float:
-        """Median distance of a body's expected joints from given ones, lengths."""
-        count = len(BODY_15)
-        off = np.linalg.norm(one.track.xy[:count] - given.keypoints[:count], axis=1)
-        return float(np.median(off[np.isfinite(off)])) / one.track.length
-
-    def _given_pose(self, expected: np.ndarray) -> BodyPose:
-        """What is given of the subject as a pose; joints that are not seen are where they are expected, (P, 2) px."""
-        joints = self._model.joint_map.joints
-        xy: np.ndarray = np.full((len(joints), 2), np.nan)
-        covariance, confidence = np.full((len(joints), 3), np.nan), np.zeros(len(joints))
-        if self._given is not None:
-            count = min(len(joints), len(self._given.keypoints))
-            xy[:count] = self._given.keypoints[:count]
-            covariance[:count], confidence[:count] = self._given.covariance[:count], self._given.confidence[:count]
-        xy = np.where(np.isfinite(xy), xy, expected)
-        network = NetworkKeypoints(joints.name, xy, confidence, covariance, 0.0 * confidence, 0.0)
-        return BodyPose(xy, covariance, confidence, network)
-
     def observe(self, image: np.ndarray, stamp_ns: int, detected: list[Person]) -> list[tuple[Person, Body]]:
         """Find the joints of everybody in the image, and new persons among those detected; returns who is whom."""
         self._size = (image.shape[1], image.shape[0])
         boxes = [one.track.box for one in self.people]
-        poses = list(self.pool.map(lambda one: self._pose(image, one), self.people))
+        poses = list(self.pool.map(lambda one: self._model.estimate(image, one.track.box), self.people))
         for group in _groups(boxes):
             self._share(image, stamp_ns, [self.people[i] for i in group], [poses[i] for i in group])
-        matches, begun = [], 0
+        matches = []
         for person in detected:
             shown = [one for one in self.people if one.shown(stamp_ns) and one.track.on(person.box)]
             best = max(shown, key=lambda one: one.track.overlap(person.box), default=None)
-            if best is None and self._may_begin(stamp_ns, begun):
-                best, begun = self._begin(image, stamp_ns, person), begun + 1
+            if best is None:
+                best = self._begin(image, stamp_ns, person)
             if best is not None:
                 matches.append((person, best))
                 best.track.detected_ns = stamp_ns
         self._lose(stamp_ns)
         return matches
-
-    @property
-    def _has_room(self) -> bool:
-        """Whether one more person may be followed."""
-        return self._most is None or sum(one is not self.subject for one in self.people) < self._most
-
-    def _may_begin(self, stamp_ns: int, begun: int) -> bool:
-        """Whether a detection is worth a pose: it may be someone hidden, or someone new where there is room."""
-        if self._most is None:
-            return True
-        return begun < self._most and (self._has_room or any(not one.shown(stamp_ns) for one in self.people))
-
-    def _pose(self, image: np.ndarray, one: Body) -> BodyPose:
-        if one is self.subject:
-            return self._given_pose(one.track.xy)
-        return self._model.estimate(image, one.track.box)
 
     def _share(self, image: np.ndarray, stamp_ns: int, group: list[Body], poses: list[BodyPose]) -> None:
         """Give the joints of poses in the boxes of overlapping persons to those whose they are."""
@@ -169,10 +92,6 @@ class Bodies:
             colours = [self._colours(image, one, pose.xy) for one, pose in zip(group, poses, strict=True)]
             given = Poses(*(np.array(v) for v in ([p.xy for p in poses], [p.confidence for p in poses], colours)))
             pose, joint = own_joints([one.track for one in group], given)
-            if self.subject in group:  # what is given is the subject's, and nobody else's
-                at = group.index(self.subject)
-                pose[pose == at], joint[joint == at] = -1, -1
-                pose[at], joint[at] = at, at
         for k, one in enumerate(group):
             if pose[k] >= 0:
                 others = [other.track.box for other in group if other is not one]
@@ -224,8 +143,6 @@ class Bodies:
 
     def _observation(self, image: np.ndarray, stamp_ns: int, one: Body, pose: BodyPose) -> PoseObservation:
         """A pose with the person's own joints, those of its feet by the second network; others have no confidence."""
-        if one is self.subject and self._given is not None:
-            return self._given
         box, joints = one.track.box, self._model.joint_map.joints
         if self._feet is not None:
             pose, joints = self._feet.add(image, box, pose), BODY_19
@@ -249,9 +166,6 @@ class Bodies:
         person.pose.judge(pose.mean_confidence, found.box, stamp_ns)
         one = Body(BodyTrack(person, pose, self._model.joint_map.joints, stamp_ns))
         again = self._again(one, stamp_ns)
-        known = again is not None and (again in self.people or again is self.subject)
-        if not (known or self._has_room):
-            return None
         if again is not None:
             again.track.continue_as(one.track)
             one = again

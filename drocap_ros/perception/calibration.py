@@ -9,7 +9,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.pinhole import centred_camera
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.tracks import check_camera_matrix
 
 #: Names of lens distortions that ``sensor_msgs/CameraInfo`` knows (``distortion_models.hpp`` of sensor_msgs).

@@ -1,4 +1,4 @@
-"""Loading of a detector and a 2D pose model from a folder of ONNX files."""
+"""Loading of a detector and a 2D pose model from a folder of networks."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TypeVar
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.detection.detector import Detector
-from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.runtime import SUFFIXES, Model, network_files, open_model
 from drocap_ros.perception.models.spec import ModelSpec, read_spec
-from drocap_ros.perception.pose.feet import FeetModel
+from drocap_ros.perception.pose.body_pose import FeetModel
 from drocap_ros.perception.pose.pose_model import PoseModel
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
@@ -43,7 +43,7 @@ def models_folder(given: str | Path | None = None) -> Path:
     return Path(data) / "drocap_ros" / "models"
 
 
-def limited_use(model: OnnxModel) -> str:
+def limited_use(model: Model) -> str:
     """Notice in the metadata of a model with limited use, else an empty string."""
     if purpose := model.metadata.get("only_for", ""):
         return model.metadata.get("notice") or f"for {purpose} only"
@@ -67,19 +67,17 @@ def load_feet_model(models_dir: str | Path, config: PoseEstimatorConfig) -> Feet
     return FeetModel(_load(Path(models_dir), "pose", config.feet_model, config, PoseModel))
 
 
-def _load(
-    folder: Path, task: str, name: str, config: PoseEstimatorConfig, build: Callable[[OnnxModel, ModelSpec], T]
-) -> T:
+def _load(folder: Path, task: str, name: str, config: PoseEstimatorConfig, build: Callable[[Model, ModelSpec], T]) -> T:
     what = _WHAT[task]
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder with a {what} (.onnx), found no such folder; {_FETCH}")
     if name != "auto":
-        path = folder / f"{name.removesuffix('.onnx')}.onnx"
+        path = _named(folder, name)
         model, spec = _read(path, config)
         if spec.task not in (task, "both"):
             raise InputError(f"{path}: expected a {what}, found a {spec.task} model ({spec.layout}); name another")
         return build(model, spec)
-    paths = sorted(folder.glob("*.onnx"), key=lambda path: _rank(path, _ORDER[task]))
+    paths = sorted(network_files(folder), key=lambda path: _rank(path, _ORDER[task]))
     why = ""
     for path in paths:
         try:
@@ -93,8 +91,14 @@ def _load(
     raise InputError(f"{folder}: expected a {what} (.onnx), found {found}{why}; {_FETCH}")
 
 
-def _read(path: Path, config: PoseEstimatorConfig) -> tuple[OnnxModel, ModelSpec]:
-    model = OnnxModel(path, config.threads, config.provider)
+def _named(folder: Path, name: str) -> Path:
+    """The network of a name, with or without its suffix; ONNX before TensorFlow Lite."""
+    files = [folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES)]
+    return next((file for file in files if file.is_file() and file.suffix in SUFFIXES), files[1])
+
+
+def _read(path: Path, config: PoseEstimatorConfig) -> tuple[Model, ModelSpec]:
+    model = open_model(path, config.threads, config.provider)
     return model, read_spec(model)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.sources.pixels import colour_rank, decoded, raw_to_bgr
+from drocap_ros.perception.sources.image_files import colour_rank, decoded, raw_to_bgr
 from drocap_ros.perception.sources.video import codec_of, decoded_packets
 from drocap_ros.recording.session import IMAGES, Message, Session, TopicInfo, header_stamp_ns
 from drocap_ros.stamps import JUMP_S, NS, StampValidator

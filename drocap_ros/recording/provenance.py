@@ -13,7 +13,7 @@ from drocap_ros.revision import git_revision
 
 #: Keys of a session's metadata.
 CONFIGURATION, MODELS, CALIBRATION = "configuration", "models", "calibration"
-_PACKAGES = ("numpy", "scipy", "onnxruntime", "opencv-python-headless", "mcap", "pymavlink", "rclpy")
+_PACKAGES = ("numpy", "scipy", "onnxruntime", "opencv-python-headless", "av", "mcap", "pymavlink", "rclpy")
 
 
 def session_provenance(namespace: str = "") -> dict[str, str]:
@@ -36,10 +36,11 @@ def configuration_text(sections: Mapping[str, Mapping[str, object]]) -> str:
 
 
 def model_hashes(folder: str | Path) -> str:
-    """SHA-256 of the ONNX files in a folder, as JSON by name; ``{}`` where there are none."""
+    """SHA-256 of the networks in a folder, as JSON by name; ``{}`` where there are none."""
     from drocap_ros.perception.models.fetch import sha256_of
+    from drocap_ros.perception.models.runtime import network_files
 
-    return json.dumps({path.name: sha256_of(path) for path in Path(folder).glob("*.onnx")}, sort_keys=True)
+    return json.dumps({path.name: sha256_of(path) for path in network_files(Path(folder))}, sort_keys=True)
 
 
 def dated_name(now_ns: int, namespace: str) -> str:

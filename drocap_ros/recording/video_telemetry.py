@@ -13,7 +13,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.perception.calibration import camera_model
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.recording.open_session import is_recording
 from drocap_ros.recording.telemetry import srt
 from drocap_ros.recording.telemetry.camera_poses import with_camera

@@ -11,7 +11,7 @@ from types import TracebackType
 import numpy as np
 
 from drocap_ros.observation import PoseObservation
-from drocap_ros.perception.persons import FoundPerson
+from drocap_ros.perception.people import FoundPerson
 from drocap_ros.perception.sources.base import Frame
 from drocap_ros.report.video_file import VideoFile
 from drocap_ros.skeleton import side_of

@@ -8,8 +8,8 @@ import numpy as np
 
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import read_spec
+from drocap_ros.perception.pose.body_pose import calibrate
 from drocap_ros.perception.pose.pose_model import PoseModel
-from drocap_ros.perception.pose.uncertainty import calibrate
 from lab.training.rendered_samples import POSE_PADDING, POSE_SIZE, make_world, pose_sample
 
 _SAMPLES, _SEED = 300, 987_654_321

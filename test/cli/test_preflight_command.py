@@ -32,7 +32,7 @@ from drocap_ros.flight.preflight.measure import all_findings
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
 from drocap_ros.flight.vehicle import LANDED_ON_GROUND, VehicleState
 from drocap_ros.perception.sources import Frame, ImageSource
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.simulation.vehicle.loopback import free_udp_port
 

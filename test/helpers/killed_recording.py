@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from recorded import NAMES, Messages
 
+from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.recover import recover_session
-from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.writer import SessionWriter
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drocap_ros.recording.mcap.schemas import schema_text, standard_types
+from drocap_ros.recording.mcap.metadata import schema_text, standard_types
 from drocap_ros.recording.mcap.writer import SessionWriter
 
 START_NS = 1_700_000_000_000_000_000

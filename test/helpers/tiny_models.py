@@ -10,9 +10,15 @@ from onnx import TensorProto, helper, numpy_helper
 
 
 def write_model(
-    path: Path, input_shape: tuple[int, ...], outputs: dict[str, np.ndarray], element_type: int = TensorProto.FLOAT
+    path: Path,
+    input_shape: tuple[int, ...],
+    outputs: dict[str, np.ndarray],
+    element_type: int = TensorProto.FLOAT,
+    layout: str = "",
 ) -> Path:
-    """A model with one image input whose outputs are ``outputs`` plus zero times the image's mean."""
+    """A model with one image input whose outputs are ``outputs`` plus zero times the image's mean, and its YAML."""
+    if layout:
+        path.with_suffix(".yaml").write_text(f"layout: {layout}\n")
     nodes, initializers, infos = [], [], []
     nodes.append(helper.make_node("Cast", ["image"], ["as_float"], to=TensorProto.FLOAT))
     nodes.append(helper.make_node("ReduceMean", ["as_float"], ["mean"], keepdims=0))

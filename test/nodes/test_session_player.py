@@ -9,7 +9,7 @@ from rosgraph_msgs.msg import Clock
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
-from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drocap_ros.perception.patches import patches_at
+from drocap_ros.perception.background_tracks import patches_at
 
 POINTS = np.array([[60.0, 50], [100, 70], [140, 50], [80, 110], [120, 100]], np.float32)
 

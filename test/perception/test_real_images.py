@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.persons import find_persons
+from drocap_ros.perception.people import find_persons
+from drocap_ros.perception.pose.body_pose import calibrate
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.pose.uncertainty import calibrate
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import BODY_15, COCO_17

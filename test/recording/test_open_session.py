@@ -4,7 +4,7 @@ from recorded import NAMES, START_NS, image_message, random_image, record
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.image_messages import read_images
-from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import is_recording, open_session, session_info
 from drocap_ros.recording.session_tracks import read_pose2d

@@ -13,7 +13,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.nodes.image_ingest import ImageIngestNode
 from drocap_ros.nodes.initializer import InitializerNode
 from drocap_ros.nodes.pose_estimator import ImageInput, ImageQueue
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.conversions import header_at
 from drocap_ros.ros.diagnostics import Key

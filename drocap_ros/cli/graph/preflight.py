@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from drocap_ros.config import DrocapConfig
     from drocap_ros.flight.preflight.findings import Finding, Measured
     from drocap_ros.flight.preflight.setup_checks import Pictures, Setup
-    from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+    from drocap_ros.perception.sources.base import ImageIngestConfig
 
 _COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red"}
 #: Images of a camera whose size is not configured.
@@ -92,11 +92,12 @@ def setup_of(config: DrocapConfig, models: Path | None = None) -> Setup:
     """Camera, source and networks that a configuration names."""
     from drocap_ros.flight.preflight.setup_checks import Setup
     from drocap_ros.perception.load_models import models_folder
+    from drocap_ros.perception.models.runtime import network_files
 
     ingest = config.image_ingest
     matrix, size, words = _camera(ingest)
     folder = models_folder(models or config.pose_estimator.models_dir)
-    present = folder.is_dir() and any(folder.glob("*.onnx"))
+    present = folder.is_dir() and bool(network_files(folder))
     return Setup(
         camera_matrix=matrix, image_size=size, camera_words=words, calibrated=bool(ingest.calibration_file),
         source=ingest.source, assumed_height_m=config.initializer.assumed_height_m,

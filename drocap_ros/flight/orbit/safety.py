@@ -251,9 +251,14 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
 
 
 def _request(state: Requesting, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
-    """While control is requested; a short gap of the data delays the orbit."""
+    """While control is requested; a short gap of the data delays the orbit.
+
+    The vehicle is held where it is, not where it was when control was asked for: the pilot flies it until the
+    autopilot grants control, and that is seen late.
+    """
     cause = _ending(state, seen, limits)
     if cause is None:
+        state = dataclasses.replace(state, position=seen.vehicle.position.copy(), yaw=seen.vehicle.yaw)
         if seen.mode.in_control and not problem:
             return _begin_orbit(seen, now_s)
         if now_s - state.since_s <= limits.safety.engage_timeout_s + limits.warm_up_s:

@@ -158,7 +158,7 @@ class Commanding(SafetyState):
 
 @dataclass(frozen=True)
 class Requesting(Commanding):
-    """Control is requested from the autopilot, at a place (3,) m and a yaw that are held meanwhile."""
+    """Control is requested from the autopilot; the vehicle's place (3,) m and yaw are what is sent meanwhile."""
 
     state = State.READY
     position: np.ndarray | None = None

@@ -1,105 +1,59 @@
-"""Specification of a model: inferred from its inputs and outputs, or read from a YAML beside it."""
+"""Specification of a model: of a known one by its content, else from a YAML beside it."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.fetch import KNOWN_MODELS, sha256_of
+from drocap_ros.perception.models.runtime import Model, network_files, open_model
 from drocap_ros.skeleton import JOINT_SETS
-
-#: Shapes of a network's outputs.
-Shapes = list[tuple[int, ...]]
 
 #: Fields of a :class:`ModelSpec` by their names, in part.
 Fields = dict[str, Any]
 
-#: Joint sets by their number of joints.
-JOINTS_BY_COUNT = {17: "coco17", 133: "wholebody133", 26: "halpe26", 16: "mpii16"}
-
-
-def _is_movenet(shapes: Shapes, _: tuple[int, int]) -> bool:
-    return len(shapes) == 1 and len(shapes[0]) == 4 and shapes[0][:2] == (1, 1) and shapes[0][3] == 3
-
-
-def _is_rtmdet_maps(shapes: Shapes, size: tuple[int, int]) -> bool:
-    grids = [grid for shape in shapes if len(shape) == 4 and (grid := map_grid(shape, size))]
-    strides = {stride for stride, _, _ in grids}
-    if len(grids) < len(shapes) or len(strides) < 3:
-        return False
-    whole = len(grids) == len(strides) and all(channels >= 5 for _, channels, _ in grids)
-    return whole or len(grids) == 2 * len(strides)
-
-
-def _is_heatmap(shapes: Shapes, size: tuple[int, int]) -> bool:
-    if any(len(shape) != 4 for shape in shapes):
-        return False
-    like_the_image = all(rows >= 16 and rows * size[0] == columns * size[1] for _, _, rows, columns in shapes)
-    return like_the_image and len({joints for _, joints, _, _ in shapes}) == 1
-
-
-def _is_simcc(shapes: Shapes, size: tuple[int, int]) -> bool:
-    if [len(shape) for shape in shapes] != [3, 3]:
-        return False
-    x, y = shapes
-    return x[:2] == y[:2] and x[2] % size[0] == 0 and y[2] % size[1] == 0
-
-
-def _is_boxes_nms(shapes: Shapes, size: tuple[int, int]) -> bool:
-    if shapes[0][-1] != 5 or len(shapes[0]) not in (2, 3):
-        return False
-    return shapes[1:] == [shapes[0][:-1]] or (len(shapes) == 1 and shapes[0][-2] not in _anchors(size))
-
-
-def _is_yolox_grid(shapes: Shapes, size: tuple[int, int]) -> bool:
-    if len(shapes) != 1 or len(shapes[0]) not in (2, 3):
-        return False
-    rows, columns = shapes[0][-2:]
-    # 57 = box, objectness, class and 17 joints of YOLO-pose, hardly 52 classes.
-    return rows in _anchors(size) and columns not in {*_anchors(size), 57}
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Meaning of a network's outputs.
-
-    task : "detector", "pose" or "both"
-    fits : whether outputs of these shapes have it, for an input size; None = it has to be named in a YAML
-    fields : of the specification, where they differ from its defaults
-    joints : axis of the last output with the joints; None = 17 of COCO, or a detector
-    """
-
-    task: str
-    fits: Callable[[Shapes, tuple[int, int]], bool] | None = None
-    fields: Fields = field(default_factory=dict)
-    joints: int | None = None
-
-
-_RAW_BGR: Fields = {"colour": "bgr"}
 _UNIT_RGB: Fields = {"std": (255.0, 255.0, 255.0), "letterbox": "centre"}
 _IMAGENET: Fields = {"mean": (123.675, 116.28, 103.53), "std": (58.395, 57.12, 57.375)}
+_RAW_BGR: Fields = {"colour": "bgr", "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
 _MMDET: Fields = {"mean": (103.53, 116.28, 123.675), "std": (57.375, 57.12, 58.395), "colour": "bgr"}
 
-#: The first one that fits is inferred.  Those of other families than the registry's are named in a YAML.
-LAYOUTS = {
-    "movenet": _Layout("pose", _is_movenet, joints=2),
-    "rtmdet-maps": _Layout("detector", _is_rtmdet_maps, _MMDET),
-    "heatmap": _Layout("pose", _is_heatmap, _IMAGENET, joints=1),
-    "simcc": _Layout("pose", _is_simcc, _IMAGENET, joints=1),
-    "boxes-nms": _Layout("detector", _is_boxes_nms),
-    "yolox-grid": _Layout("detector", _is_yolox_grid, _RAW_BGR),
-    "yolo": _Layout("detector", fields=_UNIT_RGB),
-    "yolo-nms": _Layout("detector", fields=_UNIT_RGB),
-    "yolo-pose": _Layout("both", fields=_UNIT_RGB),
-    "yolo-pose-nms": _Layout("both", fields=_UNIT_RGB),
-    "rtmo": _Layout("both", fields=_RAW_BGR),
+#: Tasks and fields, where they differ from the defaults, of the layouts.
+LAYOUTS: dict[str, tuple[str, Fields]] = {
+    "movenet": ("pose", {}),
+    "rtmdet-maps": ("detector", _MMDET),
+    "heatmap": ("pose", _IMAGENET),
+    "simcc": ("pose", _IMAGENET),
+    "boxes-nms": ("detector", {}),
+    "yolox-grid": ("detector", _RAW_BGR),
+    "yolo": ("detector", _UNIT_RGB),
+    "yolo-nms": ("detector", _UNIT_RGB),
+    "yolo-pose": ("both", _UNIT_RGB),
+    "yolo-pose-nms": ("both", _UNIT_RGB),
+    "rtmo": ("both", _RAW_BGR),
 }
+#: Axis of the last output with the joints; of the others 17 of COCO.
+_JOINT_AXIS = {"movenet": 2, "heatmap": 1, "simcc": 1}
+_JOINTS_BY_COUNT = {17: "coco17", 133: "wholebody133", 26: "halpe26", 16: "mpii16"}
+#: Known networks by the names and ranks of their outputs; their publishers export them so.
+KNOWN: dict[tuple[tuple[str, int], ...], Fields] = {
+    (("simcc_x", 3), ("simcc_y", 3)): {"layout": "simcc"},  # RTMPose
+    (("output", 3),): {"layout": "yolox-grid"},  # YOLOX of Megvii
+    (("1211", 4), ("1213", 4), ("1215", 4)): {"layout": "rtmdet-maps"},  # RTMDet-nano without NMS
+    (("conv2d_441.tmp_1/Result", 4),): {"layout": "heatmap"},  # PP-TinyPose
+    (("conv2d_441.tmp_1", 4),): {"layout": "heatmap"},
+    (("StatefulPartitionedCall:0", 4),): {"layout": "movenet"},
+    (("out0", 3),): {"layout": "yolo", "mean": (127.5,) * 3, "std": (127.5,) * 3},  # BlazePose
+    (("out0", 4), ("out1", 3)): {"layout": "movenet", "skeleton": "coco21", "std": (255.0,) * 3},
+    (("grid", 3),): {"layout": "yolox-grid"},  # the shipped ones
+    (("columns", 3), ("rows", 3)): {"layout": "simcc"},
+}
+#: Outputs that RTMDet and YOLOX with NMS share: the checksum tells which.
+_SHARED = (("dets", 3), ("labels", 2))
 
 
 @dataclass(frozen=True)
@@ -117,7 +71,7 @@ class ModelSpec:
     decoded : for "yolox-grid": whether the outputs are px
     udp : for "heatmap": trained with unit-length coordinates (MMPose's UDPHeatmap; its ViTPose and later HRNets)
     box_padding : side of the pose crop over that of the box
-    sigma_scale : standard deviations of its keypoints over those of :mod:`drocap_ros.perception.pose.uncertainty`
+    sigma_scale : standard deviations of its keypoints over those of :mod:`drocap_ros.perception.pose.body_pose`
     """
 
     layout: str
@@ -136,32 +90,73 @@ class ModelSpec:
     sigma_scale: float = 1.0
 
 
-def read_spec(model: OnnxModel) -> ModelSpec:
-    """Spec of a model from one trial run and the YAML beside it."""
+def read_spec(model: Model) -> ModelSpec:
+    """Spec of a model: that of a known one, and what the YAML beside it states."""
     path = model.path.with_suffix(".yaml")
     given = _read_yaml(path)
     size, channels_last = _input_size(model, given)
-    outputs = model(np.zeros((1, size[1], size[0], 3) if channels_last else (1, 3, size[1], size[0]), np.float32))
-    shapes: Shapes = [output.shape for output in outputs]
-    name = given.get("layout") or guess_layout(shapes, size)
-    if name is None:
+    shapes = [value.shape for value in model(np.zeros(_input_shape(size, channels_last), np.float32))]
+    fields = _known(model, shapes) | given
+    if fields.get("layout") is None:
         found = ", ".join(f"{t.name} {list(shape)}" for t, shape in zip(model.outputs, shapes, strict=True))
         raise InputError(
-            f"{model.path}: expected the outputs of a known detector or 2D pose model, found {found}; write its layout"
-            f" (layout: one of {', '.join(LAYOUTS)}) into {path.name}"
+            f"{model.path}: expected a known network or {path.name}, which says what it is, found outputs {found};"
+            f" `drocap models list --write` writes one to fill in (layout: one of {', '.join(LAYOUTS)})"
         )
-    if name not in LAYOUTS:
-        raise InputError(f"{path}: layout: expected {', '.join(LAYOUTS)}; got {name!r}; correct it")
-    fields = {"layout": name, "input_size": size, "channels_last": channels_last, "task": LAYOUTS[name].task}
-    fields |= LAYOUTS[name].fields | (_family(model.path.stem, given) if name == "boxes-nms" else {})
-    if LAYOUTS[name].task != "detector" and "skeleton" not in given:
-        fields["skeleton"] = _skeleton(LAYOUTS[name], shapes[-1], model.path.stem)
-    return _checked(ModelSpec(**{**fields, **given}), path)
+    if fields["layout"] not in LAYOUTS:
+        raise InputError(f"{path}: layout: expected {', '.join(LAYOUTS)}; got {fields['layout']!r}; correct it")
+    task, usual = LAYOUTS[fields["layout"]]
+    if fields["layout"] == "boxes-nms" and not _RAW_BGR.keys() <= fields.keys():
+        raise InputError(f"{path}: expected {', '.join(_RAW_BGR)}, which RTMDet and YOLOX do not share; write them")
+    first = {"task": task, "input_size": size, "channels_last": channels_last}
+    if task != "detector" and "skeleton" not in fields:
+        first["skeleton"] = _skeleton(_JOINT_AXIS.get(fields["layout"]), shapes[-1], model.path)
+    return _checked(ModelSpec(**{**first, **usual, **fields}), path)
 
 
-def guess_layout(shapes: Shapes, size: tuple[int, int]) -> str | None:
-    """The first layout that fits outputs of these shapes, for an input size (width, height) px; None = none does."""
-    return next((name for name, layout in LAYOUTS.items() if layout.fits and layout.fits(shapes, size)), None)
+def _input_shape(size: tuple[int, int], channels_last: bool) -> tuple[int, ...]:
+    return (1, size[1], size[0], 3) if channels_last else (1, 3, size[1], size[0])
+
+
+def _skeleton(axis: int | None, shape: tuple[int, ...], path: Path) -> str:
+    """Joint set by the number of joints."""
+    count = 17 if axis is None else shape[axis]
+    if count not in _JOINTS_BY_COUNT:
+        raise InputError(
+            f"{path}: expected {', '.join(map(str, sorted(_JOINTS_BY_COUNT)))} joints, found {count}; name its joint"
+            f" set as skeleton in {path.stem}.yaml"
+        )
+    return _JOINTS_BY_COUNT[count]
+
+
+def _known(model: Model, shapes: list[tuple[int, ...]]) -> Fields:
+    outputs = tuple((tensor.name, len(shape)) for tensor, shape in zip(model.outputs, shapes, strict=True))
+    if outputs == _SHARED:
+        digest = sha256_of(model.path)
+        family = next((known.name for known in KNOWN_MODELS if known.sha256 == digest), "")
+        return {"layout": "boxes-nms", **(_RAW_BGR if family.startswith("yolox") else _MMDET)} if family else {}
+    return KNOWN.get(outputs, {})
+
+
+def write_specs(folder: Path) -> list[Path]:
+    """Write a YAML to fill in beside each network of a folder that is not known and has none."""
+    written = []
+    for file in network_files(folder):
+        path = file.with_suffix(".yaml")
+        if path.exists():
+            continue
+        model = open_model(file)
+        try:
+            read_spec(model)
+        except InputError:
+            lines = [f"# {tensor.name}: {list(tensor.shape)}" for tensor in (*model.inputs, *model.outputs)]
+            lines += [f"layout:  # one of {', '.join(LAYOUTS)}", f"# skeleton: one of {', '.join(JOINT_SETS)}"]
+            defaults = dataclasses.asdict(ModelSpec("", "", (192, 256))).items()
+            values = ((name, list(value) if isinstance(value, tuple) else value) for name, value in defaults)
+            lines += [f"# {name}: {str(value).lower()}" for name, value in values if value != ""]
+            path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+            written.append(path)
+    return written
 
 
 def map_grid(shape: tuple[int, ...], input_size: tuple[int, int]) -> tuple[int, int, bool] | None:
@@ -187,13 +182,7 @@ def grid_centres(input_size: tuple[int, int], strides: tuple[int, ...]) -> tuple
     return np.concatenate(corners).astype(np.float32), np.concatenate(all_strides).astype(np.float32)
 
 
-def _anchors(size: tuple[int, int]) -> set[int]:
-    """Possible numbers of a grid's anchors: strides 8, 16, 32 and optionally 64."""
-    cells = [(size[0] // stride) * (size[1] // stride) for stride in (8, 16, 32, 64)]
-    return {sum(cells[:3]), sum(cells)}
-
-
-def _input_size(model: OnnxModel, given: Fields) -> tuple[tuple[int, int], bool]:
+def _input_size(model: Model, given: Fields) -> tuple[tuple[int, int], bool]:
     """(width, height) px of the input, and whether its channels are last."""
     shape = model.inputs[0].shape
     if len(shape) != 4:
@@ -204,30 +193,6 @@ def _input_size(model: OnnxModel, given: Fields) -> tuple[tuple[int, int], bool]
     if not all(isinstance(side, int) and side > 0 for side in (width, height)):  # dynamic: the usual ones
         width, height = (640, 640) if any(part in model.path.stem.lower() for part in ("det", "yolo")) else (192, 256)
     return (width, height), channels_last
-
-
-def _family(stem: str, given: Fields) -> Fields:
-    """Input of RTMDet or YOLOX with NMS: their outputs are equal, only the name distinguishes them."""
-    for part, fields in (("yolox", _RAW_BGR), ("rtmdet", _MMDET)):
-        if part in stem.lower():
-            return fields
-    if {"mean", "std", "colour"} <= set(given):
-        return {}
-    raise InputError(
-        f"{stem}.onnx: expected rtmdet or yolox in the name, since their outputs (boxes, labels) are alike; rename it"
-        f" or write colour, mean and std into {stem}.yaml"
-    )
-
-
-def _skeleton(layout: _Layout, shape: tuple[int, ...], stem: str) -> str:
-    """Joint set by the number of joints."""
-    count = 17 if layout.joints is None else shape[layout.joints]
-    if count not in JOINTS_BY_COUNT:
-        raise InputError(
-            f"{stem}.onnx: expected {', '.join(map(str, sorted(JOINTS_BY_COUNT)))} joints, found {count}; name its"
-            f" joint set as skeleton in {stem}.yaml"
-        )
-    return JOINTS_BY_COUNT[count]
 
 
 def _read_yaml(path: Path) -> Fields:

@@ -1,14 +1,125 @@
-"""Calibrated keypoints of one body in one image, the network that gives them, and the shadow that they may lie on."""
+"""Calibrated keypoints of one body in one image, its feet by a second network, the shadow that it may be."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.errors import InputError
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints, PoseModel
-from drocap_ros.perception.pose.uncertainty import calibrate
-from drocap_ros.skeleton import BODY_15, joint_map
+from drocap_ros.skeleton import BODY_15, BODY_19, indices, joint_map
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Calibration of one kind of output.
+
+    scores, sigmas : knots of the standard deviation over the peak's height, in shares of the box's longer side
+    spread_share : share of the measured spread (px^2) that adds to the variance
+    intercept, per_score, per_second_peak, per_spread : logistic regression of the confidence on the peak's height,
+        the second peak's height and ten times the spread's standard deviation over the box
+    """
+
+    scores: tuple[float, ...]
+    sigmas: tuple[float, ...]
+    spread_share: float
+    intercept: float
+    per_score: float
+    per_second_peak: float = 0.0
+    per_spread: float = 0.0
+
+
+_KNOTS = (0.0, 0.3, 0.5, 0.65, 0.75, 0.85, 0.95)
+
+#: Fitted with PP-TinyPose and MoveNet Lightning.  SimCC and one-stage models use the most similar kind's constants: the
+#: fit had no weights of theirs.
+CALIBRATIONS: dict[str, Calibration] = {
+    "heatmap": Calibration(
+        _KNOTS, (0.0444, 0.0316, 0.0282, 0.0282, 0.0282, 0.0134, 0.0099), 0.25, -1.543, 6.847, -4.887, -0.997
+    ),
+    "simcc": Calibration(_KNOTS, (0.0444, 0.0316, 0.0282, 0.0282, 0.0282, 0.0134, 0.0099), 0.25, -1.543, 6.847),
+    "movenet": Calibration(_KNOTS, (0.0494, 0.0244, 0.0221, 0.0201, 0.0173, 0.0169, 0.0129), 0.0, -0.969, 7.309),
+}
+_ONE_STAGE = CALIBRATIONS["movenet"]
+
+#: Least standard deviation, px: the pixel grid.
+_FLOOR_PX = 0.3
+
+
+def calibrate(keypoints: NetworkKeypoints, layout: str, sigma_scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance and confidence of one person's keypoints.
+
+    Parameters
+    ----------
+    keypoints : P joints
+    layout : of the pose model's outputs
+    sigma_scale : standard deviations of this model over those of the models of the fit
+
+    Returns
+    -------
+    covariance (P, 3) px^2, xx xy yy; confidence (P,) in [0, 1]
+    """
+    c = CALIBRATIONS.get(layout, _ONE_STAGE)
+    score = keypoints.score.astype(float)
+    spread = np.nan_to_num(keypoints.spread.astype(float))
+    variance = (np.interp(score, c.scores, c.sigmas) * keypoints.box_size) ** 2
+    covariance = sigma_scale**2 * (c.spread_share * spread + variance[:, None] * np.array([1.0, 0.0, 1.0]))
+    covariance += _FLOOR_PX**2 * np.array([1.0, 0.0, 1.0])
+    second_peak = keypoints.second.astype(float)
+    width = np.sqrt((spread[:, 0] + spread[:, 2]) / 2) / max(keypoints.box_size, 1.0)
+    logit = c.intercept + c.per_score * score + c.per_second_peak * second_peak + c.per_spread * 10.0 * width
+    return covariance, 1.0 / (1.0 + np.exp(-np.clip(logit, -30, 30)))
+
+
+_ANKLES = indices(BODY_19.joints, ("rankle", "lankle"))
+#: Toe and heel of each side.
+_FEET = np.array([indices(BODY_19.joints, (f"{side}toe", f"{side}heel")) for side in "rl"])
+#: Distance of both networks' ankles, share of the body's longer extent, from which they see different legs: a shank is
+#: 0.22 of it, and the errors of either network are below 0.03.
+_SAME_ANKLE = 0.1
+
+
+class FeetModel:
+    """A pose network that serves for the feet alone."""
+
+    def __init__(self, model: PoseModel) -> None:
+        self._body = BodyPoseModel(model)
+        if self._body.joint_map.joints is not BODY_19:
+            raise InputError(
+                f"{model.model.path}: expected a network with toes and heels (coco21, halpe26, wholebody133), found"
+                f" {model.joints.name}; name another for the feet"
+            )
+
+    def add(self, image: np.ndarray, box: np.ndarray, pose: BodyPose) -> BodyPose:
+        """The pose with ``BODY_19``: a foot where both networks see its ankle in one place, else it is not seen.
+
+        Parameters
+        ----------
+        image : (H, W, 3) uint8 BGR
+        box : (4,) px of the person, where the joints of ``pose`` give none
+        """
+        extent, around = pose.extent(), pose.box()
+        seen = self._body.estimate(image, box if around is None else around)
+        count = len(BODY_19)
+        xy, covariance, confidence = np.full((count, 2), np.nan), np.full((count, 3), np.nan), np.zeros(count)
+        for ours, theirs in ((xy, pose.xy), (covariance, pose.covariance), (confidence, pose.confidence)):
+            ours[: len(BODY_15)] = theirs[: len(BODY_15)]
+        if extent is None:
+            return BodyPose(xy, covariance, confidence, pose.network)
+        gap = np.linalg.norm(pose.xy[_ANKLES][:, None] - seen.xy[_ANKLES], axis=-1)
+        # From the side networks exchange legs: a foot belongs to the leg whose ankle it has.
+        crossed = gap[0, 1] + gap[1, 0] < gap[0, 0] + gap[1, 1]
+        most = _SAME_ANKLE * float((extent[2:] - extent[:2]).max())
+        for side in (0, 1):
+            other = 1 - side if crossed else side
+            if gap[side, other] < most:
+                xy[_FEET[side]] = seen.xy[_FEET[other]]
+                covariance[_FEET[side]] = seen.covariance[_FEET[other]]
+                confidence[_FEET[side]] = seen.confidence[_FEET[other]]
+        return BodyPose(xy, covariance, confidence, pose.network, None if crossed else seen.space)
+
 
 CLEAR_CONFIDENCE = 0.8  # mean confidence of a clear pose; persons in bad light or from steeply above have 0.5 to 0.9
 _SEEN = 0.3  # least confidence of a joint that counts: boxes without a person have a mean below 0.33

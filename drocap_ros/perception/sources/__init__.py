@@ -7,9 +7,15 @@ from pathlib import Path
 
 from drocap_ros.errors import InputError
 from drocap_ros.file_kind import FileKind, file_kind
-from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind, prefetch
+from drocap_ros.perception.sources.base import (
+    Frame,
+    ImageIngestConfig,
+    ImageSource,
+    SourceEvent,
+    SourceEventKind,
+    prefetch,
+)
 from drocap_ros.perception.sources.image_files import ImageFileSource
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.perception.sources.live_source import open_camera, open_stream
 from drocap_ros.perception.sources.video import VideoSource
 

@@ -1,7 +1,8 @@
-"""Image files: one file, or a folder in the order of the names; encoding as JPEG."""
+"""Pixels of any encoding to BGR of 8 bits; image files: one, or a folder in the order of the names."""
 
 from __future__ import annotations
 
+import os
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -10,7 +11,151 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.base import Frame, ImageSource
-from drocap_ros.perception.sources.pixels import to_bgr
+
+# The header of a small file can declare an image of gigabytes.  OpenCV reads this limit when it is imported.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
+#: Largest raw image, px.
+_MAX_PIXELS = 200_000_000
+#: Last bytes of a JPEG that must contain its end marker; cameras append padding.
+_JPEG_TAIL = 4096
+#: Percentiles of a 16-bit image that become black and white: a thermal camera or a sensor of 12 bits uses a small part
+#: of the range, a few dead pixels all of it.
+_BLACK_WHITE = (0.5, 99.5)
+#: Every such pixel of a row and of a column counts for them.
+_SAMPLING = 4
+#: order of the colours -> (samples per pixel, name of OpenCV's conversion to BGR); bits follow the name
+_ORDERS: dict[str, tuple[int, str | None]] = {
+    "bgr": (3, None),
+    "rgb": (3, "COLOR_RGB2BGR"),
+    "bgra": (4, "COLOR_BGRA2BGR"),
+    "rgba": (4, "COLOR_RGBA2BGR"),
+    "mono": (1, "COLOR_GRAY2BGR"),
+    # ROS names a Bayer pattern by its first two pixels, OpenCV by those of the second row.
+    "bayer_rggb": (1, "COLOR_BayerBG2BGR"),
+    "bayer_bggr": (1, "COLOR_BayerRG2BGR"),
+    "bayer_gbrg": (1, "COLOR_BayerGR2BGR"),
+    "bayer_grbg": (1, "COLOR_BayerGB2BGR"),
+}
+_OF_CHANNELS = {"1": "mono", "3": "bgr", "4": "bgra"}
+#: Two bytes per pixel, interleaved.
+_PACKED = dict.fromkeys(("yuv422", "uyvy"), "COLOR_YUV2BGR_UYVY")
+_PACKED |= dict.fromkeys(("yuv422_yuy2", "yuyv", "yuy2"), "COLOR_YUV2BGR_YUYV")
+#: Luma, then chroma of half the rows.
+_PLANAR = {"nv12": "NV12", "nv21": "NV21", "i420": "I420", "yuv420": "I420", "yuv420p": "I420", "yv12": "YV12"}
+_NAMED = re.compile(r"(bgra?|rgba?|mono|bayer_[rgb]{4})_?(8|10|12|14|16)")
+_TYPED = re.compile(r"(8U|16U|32F)C([134])")
+_DEPTH = re.compile(r"16[US]C1|32FC1|64FC1|.*compressedDepth.*")
+_GREY = re.compile(r"mono|8UC1")
+
+
+def colour_rank(encoding: str) -> int:
+    """0 of an encoding or format with colours, 1 of grey, 2 of mostly distances; some thermal cameras use those too."""
+    return 2 if _DEPTH.match(encoding) else int(bool(_GREY.match(encoding)))
+
+
+def to_bgr(image: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 BGR from a grey, alpha, 16-bit or float image."""
+    if image.dtype != np.uint8:
+        image = _eight_bits(image)
+    if image.ndim == 2:
+        image = image[..., None]
+    if image.shape[2] in (1, 2):  # grey, grey + alpha
+        image = np.repeat(image[..., :1], 3, axis=2)
+    return np.ascontiguousarray(image[..., :3])
+
+
+def _eight_bits(image: np.ndarray) -> np.ndarray:
+    """The range of an image's values, or 0 to 1 of floats, spread over 0 to 255; one value alone keeps its share."""
+    full = 1.0 if image.dtype.kind == "f" else float(np.iinfo(image.dtype).max)
+    values = np.nan_to_num(image.astype(np.float32), posinf=0.0, neginf=0.0)
+    low, high = np.percentile(values[::_SAMPLING, ::_SAMPLING], _BLACK_WHITE)
+    if high <= low or (full == 1.0 and low >= 0.0 and high <= 1.0):
+        low, high = 0.0, full
+    spread: np.ndarray = (values - low) * (255.0 / (high - low)) + 0.5
+    return np.clip(spread, 0, 255).astype(np.uint8)
+
+
+def decoded(data: np.ndarray, form: str) -> np.ndarray:
+    """(H, W, 3) uint8 BGR of a JPEG, PNG or other image in memory; ``form`` is its stated format."""
+    import cv2
+
+    if data[:2].tobytes() == b"\xff\xd8" and b"\xff\xd9" not in data[-_JPEG_TAIL:].tobytes():
+        raise InputError(f"image: expected a whole JPEG, got {data.size} bytes without its end; check the link")
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"image: expected JPEG, PNG or another image, got format {form[:40]!r} that does not decode")
+    return to_bgr(np.asarray(image))
+
+
+def raw_to_bgr(data: np.ndarray, size: tuple[int, int], step: int, encoding: str, big_endian: bool) -> np.ndarray:
+    """(H, W, 3) uint8 BGR of the bytes of a raw image.
+
+    Parameters
+    ----------
+    data : (N,) uint8
+    size : (width, height) px
+    step : bytes per row
+    encoding : as ROS names them, also planar YUV
+    big_endian : order of the bytes of a sample
+    """
+    import cv2
+
+    try:
+        if encoding.lower() in _PLANAR:
+            return _planar(data, size, step, encoding.lower())
+        return _interleaved(data, size, step, encoding, big_endian)
+    except cv2.error:
+        raise InputError(f"image: expected a size that {encoding} can have, got {size[0]}x{size[1]} px") from None
+
+
+def _rows(data: np.ndarray, shape: tuple[int, int], step: int, words: str) -> np.ndarray:
+    """(rows, bytes) of data whose rows are ``step`` bytes apart."""
+    rows, width = shape
+    if not 0 < rows * width <= _MAX_PIXELS * 16 or step < width or data.size < rows * step:
+        raise InputError(f"image: expected {rows} rows of {step} bytes for {words}, got {data.size} bytes")
+    return data[: rows * step].reshape(rows, step)[:, :width]
+
+
+def _planar(data: np.ndarray, size: tuple[int, int], step: int, encoding: str) -> np.ndarray:
+    import cv2
+
+    (width, height), words = size, f"{size[0]}x{size[1]} px {encoding}"
+    rows = height + (height + 1) // 2
+    step = step if step >= width and data.size >= rows * step else width  # some state the bytes of all planes
+    planes = np.ascontiguousarray(_rows(data, (rows, width), step, words))
+    return np.asarray(cv2.cvtColor(planes, getattr(cv2, f"COLOR_YUV2BGR_{_PLANAR[encoding]}")))
+
+
+def _interleaved(data: np.ndarray, size: tuple[int, int], step: int, encoding: str, big_endian: bool) -> np.ndarray:
+    import cv2
+
+    count, conversion, kind = _layout(encoding)
+    (width, height), words = size, f"{size[0]}x{size[1]} px {encoding}"
+    kind = kind.newbyteorder(">" if big_endian else "<")
+    rows = np.ascontiguousarray(_rows(data, (height, width * count * kind.itemsize), step, words)).view(kind)
+    pixels = rows.reshape(height, width, count) if count > 1 else rows
+    if kind.itemsize > 1:
+        pixels = _eight_bits(pixels)
+    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)))
+
+
+def _layout(encoding: str) -> tuple[int, str | None, np.dtype]:
+    """Samples per pixel, conversion, and type of a sample."""
+    if encoding.lower() in _PACKED:
+        return 2, _PACKED[encoding.lower()], np.dtype("u1")
+    if typed := _TYPED.fullmatch(encoding):
+        order, kind = _OF_CHANNELS[typed[2]], {"8U": "u1", "16U": "u2", "32F": "f4"}[typed[1]]
+    elif (named := _NAMED.fullmatch(encoding)) and named[1] in _ORDERS:
+        order, kind = named[1], "u1" if named[2] == "8" else "u2"
+    else:
+        known = (*(f"{name}8 or 16" for name in _ORDERS), *_PACKED, *_PLANAR, "8UC3 and the like")
+        raise InputError(f"image: expected encoding {', '.join(known)}, got {encoding[:40]!r}; convert it")
+    return *_ORDERS[order], np.dtype(kind)
+
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 

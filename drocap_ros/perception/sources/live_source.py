@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
-from drocap_ros.perception.sources.pixels import to_bgr
+from drocap_ros.perception.sources.base import Frame, ImageIngestConfig, ImageSource, SourceEvent, SourceEventKind
+from drocap_ros.perception.sources.image_files import to_bgr
 from drocap_ros.perception.sources.video import Decoder, pyav
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.tracking.appearance import describe
+from drocap_ros.perception.tracking.association import MIXED_IOU, could_be
 from drocap_ros.perception.tracking.camera_motion import moved_box, sweeps
-from drocap_ros.perception.tracking.identity import MIXED_IOU, could_be
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, SURE_CONFIDENCE, Person, Subject, boxes_of
 from drocap_ros.perception.tracking.subject import SAME_BOX_IOU, SubjectTracker
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.detector import Detections, Detector
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient, suppress
-from drocap_ros.perception.tracking.identity import FORGET_S, could_be
+from drocap_ros.perception.tracking.association import FORGET_S, could_be
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.subject import SubjectTracker

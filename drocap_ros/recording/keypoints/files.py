@@ -21,15 +21,16 @@ import numpy as np
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.recording.keypoints.content import (
     LARGEST_PX,
+    NAMES_BY_COUNT,
     Content,
     Label,
+    joint_name,
     numbers_of,
     one_person,
     read_arrays,
     table,
     walk,
 )
-from drocap_ros.recording.keypoints.names import NAMES_BY_COUNT, joint_name
 from drocap_ros.tracks import MAX_FRAMES, Tracks, kind_of, load_tracks, read_npz, save_tracks, without_unseen
 
 logger = logging.getLogger(__name__)

@@ -16,8 +16,7 @@ from pathlib import Path
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap import metadata as bag
 from drocap_ros.recording.mcap.file import McapFile
-from drocap_ros.recording.mcap.metadata import FileRecord, TopicRecord
-from drocap_ros.recording.mcap.schemas import type_hash
+from drocap_ros.recording.mcap.metadata import FileRecord, TopicRecord, type_hash
 from drocap_ros.recording.mcap.stream import MAGIC, Damage, DamageKind, McapChannel, McapStream, counted_channels
 
 _BESIDE = ".recovering"

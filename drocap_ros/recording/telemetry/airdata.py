@@ -16,9 +16,16 @@ import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.interpolation import true_runs
-from drocap_ros.recording.telemetry.log import Lens, LogFormat, TelemetryLog, make_log
-from drocap_ros.recording.telemetry.plausibility import Series, plausible
-from drocap_ros.recording.telemetry.series import dji_attitude, from_first_fix
+from drocap_ros.recording.telemetry.log import (
+    Lens,
+    LogFormat,
+    Series,
+    TelemetryLog,
+    dji_attitude,
+    from_first_fix,
+    make_log,
+    plausible,
+)
 
 #: Characters of a line, beyond which the file is no table: Airdata's lines have about a thousand.
 _LINE = 16384

@@ -13,8 +13,15 @@ import numpy as np
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.flight.vehicle import orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.rotations import quaternion_multiply
-from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, make_log
-from drocap_ros.recording.telemetry.series import at_stamps, from_first_fix
+from drocap_ros.recording.telemetry.log import (
+    Lack,
+    LogFormat,
+    LogLack,
+    TelemetryLog,
+    at_stamps,
+    from_first_fix,
+    make_log,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,11 +15,19 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle import orientation_to_ros
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.recording.telemetry import djmd_layouts as layouts
-from drocap_ros.recording.telemetry.djmd_layouts import Layout, Model
-from drocap_ros.recording.telemetry.log import Lack, Lens, LogFormat, LogLack, TelemetryLog, make_log
-from drocap_ros.recording.telemetry.plausibility import Series, plausible
-from drocap_ros.recording.telemetry.protobuf import Message, Value
-from drocap_ros.recording.telemetry.series import dji_attitude, from_first_fix
+from drocap_ros.recording.telemetry.djmd_layouts import Layout, Message, Model, Value
+from drocap_ros.recording.telemetry.log import (
+    Lack,
+    Lens,
+    LogFormat,
+    LogLack,
+    Series,
+    TelemetryLog,
+    dji_attitude,
+    from_first_fix,
+    make_log,
+    plausible,
+)
 from drocap_ros.recording.telemetry.srt import TEXT_TRACKS, read_srt
 from drocap_ros.recording.telemetry.video_tracks import find_track, read_samples
 from drocap_ros.tracks import MAX_FRAMES

@@ -18,8 +18,16 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.telemetry.log import Lack, Lens, LogFormat, LogLack, TelemetryLog, make_log
-from drocap_ros.recording.telemetry.series import dji_attitude, from_first_fix
+from drocap_ros.recording.telemetry.log import (
+    Lack,
+    Lens,
+    LogFormat,
+    LogLack,
+    TelemetryLog,
+    dji_attitude,
+    from_first_fix,
+    make_log,
+)
 from drocap_ros.recording.telemetry.video_tracks import find_track, read_samples
 from drocap_ros.tracks import MAX_FRAMES
 

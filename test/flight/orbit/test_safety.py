@@ -286,6 +286,24 @@ def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():
     assert reduce(state, LOITER, 1.0, Command.STOP, limits)[1].action == Action.NOTHING
 
 
+@pytest.mark.parametrize("speed_m_s", [0.5, 2.0, 5.0])
+@pytest.mark.parametrize("granted_s", [0.2, 1.0, 4.0])
+def test_a_pending_engage_holds_the_vehicle_where_it_is_while_the_pilot_flies_on(speed_m_s, granted_s):
+    """The grant is seen late: until then what is sent must lead nowhere, least of all back or nearer."""
+    state, _ = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    for step in range(1, round(granted_s * 20)):
+        now_s = 0.05 * step
+        angle = speed_m_s * now_s / 6.0
+        about = np.array([6.0 * np.cos(angle), 6.0 * np.sin(angle), 2.5])
+        seen = changed(LOITER, position=about, yaw=0.1 * now_s)
+        state, decision = reduce(state, seen, now_s, None, LIMITS)
+        assert decision.action == Action.HOLD
+        np.testing.assert_array_equal(state.position, about)
+        assert state.yaw == 0.1 * now_s
+    nearer = changed(seen, subject_distance_m=2.0)
+    assert reduce(state, nearer, now_s + 0.05, None, LIMITS)[1].action == Action.NOTHING
+
+
 def test_disarming_ends_the_orbit_and_disabled_commands_are_refused():
     state, decision = reduce(orbiting(), changed(GOOD, armed=False), 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.IDLE, Action.NOTHING)

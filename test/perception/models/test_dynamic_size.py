@@ -61,7 +61,7 @@ def tiny_maps():
 
 
 def test_network_with_fixed_outputs_keeps_its_size(tmp_path, monkeypatch):
-    write_model(tmp_path / "rtmdet-tiny.onnx", (1, 3, 96, 128), tiny_maps())
+    write_model(tmp_path / "rtmdet-tiny.onnx", (1, 3, 96, 128), tiny_maps(), layout="rtmdet-maps")
     detector = load_detector(tmp_path, PoseEstimatorConfig())
     assert not detector.accepts_other_sizes()
     seen = sizes_seen(monkeypatch, detector)

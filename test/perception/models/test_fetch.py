@@ -13,9 +13,7 @@ from typing import ClassVar
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.models.fetch import fetch
-from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, KnownModel, known_model
-from drocap_ros.perception.models.wheel import FetchError
+from drocap_ros.perception.models.fetch import DEFAULT_FETCH, KNOWN_MODELS, FetchError, KnownModel, fetch, known_model
 
 WEIGHTS = bytes(range(256)) * 4000
 SHA = hashlib.sha256(WEIGHTS).hexdigest()
@@ -130,5 +128,5 @@ def test_registry_is_complete():
         assert m.licence
         assert m.training_data
         assert m.task in ("detector", "pose")
-        assert len(m.sha256) == (64 if m.url else 0)
+        assert len(m.sha256) == (64 if m.offered else 0)
     assert known_model("yolox_nano.onnx") is known_model("yolox-nano")

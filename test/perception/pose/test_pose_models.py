@@ -9,7 +9,7 @@ from tiny_models import TensorProto, heatmaps, write_model
 from drocap_ros.errors import InputError
 from drocap_ros.perception.load_models import load_pose_model
 from drocap_ros.perception.models.network_input import crop_around, cut
-from drocap_ros.perception.pose.peaks import decode_heatmaps, decode_simcc
+from drocap_ros.perception.pose.pose_model import decode_heatmaps, decode_simcc
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 IMAGE = np.zeros((400, 300, 3), np.uint8)
@@ -90,7 +90,7 @@ def heatmap_outputs(joints: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
 )
 def test_heatmap_model_of_each_joint_set(tmp_path, joints, skeleton):
     outputs, expected = heatmap_outputs(joints)
-    write_model(tmp_path / "a.onnx", (1, 3, 256, 192), outputs)
+    write_model(tmp_path / "a.onnx", (1, 3, 256, 192), outputs, layout="heatmap")
     model = load(tmp_path)
     assert (model.spec.layout, model.joints.name) == ("heatmap", skeleton)
     np.testing.assert_allclose(model.estimate(IMAGE, BOX).xy, in_image(expected), atol=0.1)
@@ -99,7 +99,7 @@ def test_heatmap_model_of_each_joint_set(tmp_path, joints, skeleton):
 def test_last_of_stacked_heatmaps_is_used(tmp_path):
     cells = np.full((16, 2), 30.0)
     outputs = {"first": heatmaps(16, 64, 64, cells - 10), "second": heatmaps(16, 64, 64, cells)}
-    write_model(tmp_path / "hourglass.onnx", (1, 3, 256, 256), outputs)
+    write_model(tmp_path / "hourglass.onnx", (1, 3, 256, 256), outputs, layout="heatmap")
     model = load(tmp_path)
     expected = in_image(np.full((16, 2), 120.0), (256, 256))
     np.testing.assert_allclose(model.estimate(IMAGE, BOX).xy, expected, atol=0.1)
@@ -108,7 +108,7 @@ def test_last_of_stacked_heatmaps_is_used(tmp_path):
 def test_other_joint_set_of_17_comes_from_the_yaml(tmp_path):
     outputs, _ = heatmap_outputs(17)
     write_model(tmp_path / "b.onnx", (1, 3, 256, 192), outputs)
-    (tmp_path / "b.yaml").write_text("skeleton: h36m17\nudp: true\nsigma_scale: 0.8\n")
+    (tmp_path / "b.yaml").write_text("layout: heatmap\nskeleton: h36m17\nudp: true\nsigma_scale: 0.8\n")
     model = load(tmp_path, pose_model="b")
     assert (model.joints.name, model.spec.udp, model.spec.sigma_scale) == ("h36m17", True, 0.8)
 
@@ -129,7 +129,7 @@ def test_simcc_model(tmp_path):
 def test_movenet_model_takes_uint8_channels_last(tmp_path):
     rows = np.full((1, 1, 17, 3), 0.5, np.float32)
     rows[..., 0] = 0.25  # y comes first
-    write_model(tmp_path / "a.onnx", (1, 192, 192, 3), {"out": rows}, TensorProto.UINT8)
+    write_model(tmp_path / "a.onnx", (1, 192, 192, 3), {"out": rows}, TensorProto.UINT8, "movenet")
     model = load(tmp_path)
     assert (model.spec.layout, model.spec.channels_last) == ("movenet", True)
     expected = in_image(np.tile([96.0, 48.0], (17, 1)), (192, 192))
@@ -176,14 +176,14 @@ def test_crop_samples_the_image_at_its_mapping(scale):
 
 def test_unknown_outputs_are_refused_with_the_layouts(tmp_path):
     write_model(tmp_path / "odd.onnx", (1, 3, 256, 192), {"embedding": np.zeros((1, 512), np.float32)})
-    with pytest.raises(InputError, match=r"embedding \[1, 512\]; write its layout \(layout: one of .*odd\.yaml"):
+    with pytest.raises(InputError, match=r"odd\.yaml, which .* embedding \[1, 512\]; .*\(layout: one of "):
         load(tmp_path, pose_model="odd")
 
 
 def test_nan_outputs_are_refused(tmp_path):
     outputs, _ = heatmap_outputs(17)
     outputs["heatmaps"][0, 3, 4, 5] = np.nan
-    write_model(tmp_path / "a.onnx", (1, 3, 256, 192), outputs)
+    write_model(tmp_path / "a.onnx", (1, 3, 256, 192), outputs, layout="heatmap")
     with pytest.raises(InputError, match="expected finite numbers, got NaN or infinity"):
         load(tmp_path, pose_model="a")
 
@@ -217,7 +217,7 @@ def test_invalid_model_file_is_refused(tmp_path):
 def test_invalid_yaml_is_refused(tmp_path, text, complaint):
     outputs, _ = heatmap_outputs(17)
     write_model(tmp_path / "a.onnx", (1, 3, 256, 192), outputs)
-    (tmp_path / "a.yaml").write_text(text)
+    (tmp_path / "a.yaml").write_text(text if ":" not in text or "layout" in text else f"layout: heatmap\n{text}")
     with pytest.raises(InputError, match=complaint):
         load(tmp_path, pose_model="a")
 

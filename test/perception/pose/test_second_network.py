@@ -83,7 +83,7 @@ def test_the_feet_of_another_person_in_the_box_are_not_taken(tmp_path, pose):
 
 def test_a_network_without_feet_is_refused(tmp_path):
     rows = np.full((1, 1, 17, 3), 0.5, np.float32)
-    write_model(tmp_path / "plain.onnx", (1, 3, 256, 256), {"out": rows})
+    write_model(tmp_path / "plain.onnx", (1, 3, 256, 256), {"out": rows}, layout="movenet")
     with pytest.raises(InputError, match=r"plain\.onnx: expected a network with toes and heels .* found coco17"):
         load_feet_model(tmp_path, PoseEstimatorConfig(feet_model="plain"))
 

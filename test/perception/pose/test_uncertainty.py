@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drocap_ros.perception.pose.body_pose import CALIBRATIONS, calibrate
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.pose.uncertainty import CALIBRATIONS, calibrate
 
 
 def keypoints(score, spread=0.0, second_peak=0.0, box=200.0) -> NetworkKeypoints:

@@ -12,7 +12,7 @@ from test_sources import patch_box, write_video
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources import SourceEventKind, open_source
-from drocap_ros.perception.sources.pixels import to_bgr
+from drocap_ros.perception.sources.image_files import to_bgr
 
 cv2 = pytest.importorskip("cv2")
 

@@ -13,7 +13,7 @@ import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources import SourceEventKind, open_source
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.perception.sources.live_source import StreamClock
 
 cv2 = pytest.importorskip("cv2")

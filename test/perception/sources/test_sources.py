@@ -9,9 +9,8 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.perception.calibration import load_calibration
 from drocap_ros.perception.sources import Frame, SourceEventKind, open_source
-from drocap_ros.perception.sources.base import prefetch
+from drocap_ros.perception.sources.base import ImageIngestConfig, prefetch
 from drocap_ros.perception.sources.image_files import read_image
-from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 
 cv2 = pytest.importorskip("cv2")
 

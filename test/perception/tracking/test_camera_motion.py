@@ -8,9 +8,9 @@ import pytest
 
 from drocap_ros.perception.background_tracks import BackgroundTracks
 from drocap_ros.perception.detection.detector import Detections
-from drocap_ros.perception.tracking.box_filter import BoxFilter
 from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box, sweeps
 from drocap_ros.perception.tracking.other_poses import due_bystander, possible_subjects
+from drocap_ros.perception.tracking.person import BoxFilter
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.subject import SubjectTracker
 

@@ -8,7 +8,7 @@ from test_subject_tracking import BLUE, GREEN, RED, SIZE, STEP, Scene, offset
 
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.pose.body_pose import shadow_share, without_shadow
-from drocap_ros.perception.tracking.identity import fits_other
+from drocap_ros.perception.tracking.association import fits_other
 from drocap_ros.perception.tracking.other_poses import due_bystander, possible_subjects
 from drocap_ros.perception.tracking.person import Person, PoseBelief
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig

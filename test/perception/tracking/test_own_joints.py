@@ -7,9 +7,7 @@ from people_scenes import PeopleScene, camera_of, people_of
 
 from drocap_ros.perception.pose.body_pose import BodyPose
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.tracking.body_track import BodyTrack
-from drocap_ros.perception.tracking.contested import contested
-from drocap_ros.perception.tracking.own_joints import Poses, own_joints
+from drocap_ros.perception.tracking.own_joints import BodyTrack, Poses, contested, own_joints
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.skeleton import BODY_15
 

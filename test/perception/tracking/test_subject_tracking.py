@@ -7,8 +7,7 @@ import pytest
 
 from drocap_ros.errors import ParameterError
 from drocap_ros.perception.detection.detector import Detections
-from drocap_ros.perception.tracking.association import Seen, assign
-from drocap_ros.perception.tracking.identity import could_be
+from drocap_ros.perception.tracking.association import Seen, assign, could_be
 from drocap_ros.perception.tracking.other_poses import due_bystander
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig

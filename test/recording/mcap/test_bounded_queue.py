@@ -1,6 +1,6 @@
 import threading
 
-from drocap_ros.recording.mcap.bounded_queue import BoundedQueue, QueuedMessage
+from drocap_ros.recording.mcap.writer import BoundedQueue, QueuedMessage
 
 
 def message(topic, size=10, number=0):

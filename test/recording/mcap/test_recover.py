@@ -9,8 +9,8 @@ from recorded import NAMES, START_NS, write_poses
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.recover import recover_session
-from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.stream import DamageKind, McapStream
 from drocap_ros.recording.mcap.writer import SessionWriter

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.mcap.schemas import own_definitions, schema_text, standard_types, type_hash
+from drocap_ros.recording.mcap.metadata import own_definitions, schema_text, standard_types, type_hash
 
 
 def test_schema_is_the_file_followed_by_its_dependencies(root):

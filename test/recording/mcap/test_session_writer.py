@@ -10,7 +10,7 @@ from recorded import NAMES, START_NS, write_poses
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.file import CommittedFile, McapFile
-from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session, session_info

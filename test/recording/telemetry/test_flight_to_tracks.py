@@ -9,7 +9,7 @@ from recorded import NAMES
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
