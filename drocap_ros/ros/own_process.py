@@ -20,7 +20,7 @@ from drocap_ros.errors import NodeError
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.sources.pixels import decoded
+from drocap_ros.perception.sources.image_files import decoded
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.common.engine import blas_threads
 
