@@ -31,12 +31,12 @@ BUDGETS = {
      "api", "config", "pipeline", "people", "live_replay"): 3.85,  # points of the scene, everybody in the pictures
     ("perception",): 6.60,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 12.65,  # one engine and one camera; paths by fixed points, several recordings, live windows
-    ("flight",): 9.35,  # a process that holds after the bridge's death; conditions with their values; preflight
+    ("flight",): 9.15,  # a process that holds after the bridge's death; conditions with their values; preflight
     ("recording",): 5.30,  # every format of telemetry and of keypoints stayed; damaged and foreign recordings
-    ("simulation",): 3.55,  # reports err as recorded ones
+    ("simulation",): 3.45,  # reports err as recorded ones
     ("evaluation",): 1.0,  # truth from C3D, TRC and BVH by the names of other programs (0.34)
     ("export", "report", "view"): 4.30,  # exports for OpenSim, a report of several persons, the video beside the body
-    ("ros", "nodes", "bringup"): 4.65,  # lockstep and processes of their own
+    ("ros", "nodes", "bringup"): 4.60,  # lockstep and processes of their own
     ("cli",): 4.60,  # batch, preflight and top stayed whole
     ("lab", "benchmarks"): 11.10,  # studies, replay of reports, faults of flights, damaged files of every reader
 }  # fmt: skip

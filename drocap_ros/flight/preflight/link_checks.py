@@ -18,6 +18,14 @@ _C = ConditionCode
 _ENOUGH = 0.8  # share of a wanted rate: autopilots round intervals to their own loops
 _MOST_SPREAD_S = 0.02  # of the clock's offset: at 25 deg/s half a degree of yaw
 _MOST_BAD = 0.02  # share of the data: a wiring without errors has none
+#: Parameter of the greatest age in flight, and the conditions that watch it, by message.
+_STATUS = ("max_status_age_s", (_C.STATUS_OUTDATED,))
+_WATCHED = {
+    "ATTITUDE_QUATERNION": ("max_state_age_s", (_C.ATTITUDE_OUTDATED, _C.LINK_SILENT)),
+    "LOCAL_POSITION_NED": ("max_state_age_s", (_C.POSITION_FROZEN,)),
+    "HEARTBEAT": ("max_heartbeat_age_s", (_C.MODE_OUTDATED,)),
+    **dict.fromkeys(("GPS_RAW_INT", "SYS_STATUS", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), _STATUS),
+}
 _MOUNT, _ECHO, _HEARTBEAT = "GIMBAL_DEVICE_ATTITUDE_STATUS", "POSITION_TARGET_LOCAL_NED", "HEARTBEAT"
 
 
@@ -113,15 +121,8 @@ def _judged(stream: Stream, limit_s: float, *, short: bool) -> tuple[Level, str]
 
 def _limit(config: MavlinkBridgeConfig, name: str) -> tuple[float, tuple[ConditionCode, ...]]:
     """Greatest age of the message in flight, 0 = none, and the conditions that watch it."""
-    if name == "ATTITUDE_QUATERNION":
-        return config.max_state_age_s, (_C.ATTITUDE_OUTDATED, _C.LINK_SILENT)
-    if name == "LOCAL_POSITION_NED":
-        return config.max_state_age_s, (_C.POSITION_FROZEN,)
-    if name == _HEARTBEAT:
-        return config.max_heartbeat_age_s, (_C.MODE_OUTDATED,)
-    if name in ("GPS_RAW_INT", "SYS_STATUS", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):
-        return config.max_status_age_s, (_C.STATUS_OUTDATED,)
-    return 0.0, ()
+    parameter, conditions = _WATCHED.get(name, ("", ()))
+    return getattr(config, parameter, 0.0), conditions
 
 
 @check("telemetry_delay", "delay of telemetry", _C.ATTITUDE_OUTDATED)
