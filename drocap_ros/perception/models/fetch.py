@@ -17,7 +17,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.perception.models.runtime import MISSING_LITERT
+
+#: What to do where no LiteRT is.
+MISSING_LITERT = "expected the package ai-edge-litert, which runs it, found none; run pip install ai-edge-litert"
 
 #: Seconds of one package, of at most 36 MB, on a line of 2 Mbit/s.
 _PIP_TIMEOUT_S = 180
