@@ -20,7 +20,7 @@ from drocap_ros.contacts import TRUE_REST_M_S
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.evaluation.truth_files import load_mocap
 from drocap_ros.geometry.alignment import apply_similarity, similarity
-from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.rotations import unpack_covariance
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.network import LifterInput
 from drocap_ros.reconstruction.reconstruct import reconstruct

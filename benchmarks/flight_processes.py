@@ -32,7 +32,7 @@ from drocap_ros.flight.mavlink.guardian import PACKETS, PERIOD_S
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.flight.vehicle import camera_rotation
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.simulation.keypoint_errors import noisy_keypoints
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person

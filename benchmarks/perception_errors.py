@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 #: Half of the orbits have errors; in the others perception errs as a detector does.

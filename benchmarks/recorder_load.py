@@ -16,8 +16,8 @@ def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
     import cv2
     import numpy as np
 
+    from drocap_ros.keypoints import PoseObservation
     from drocap_ros.msg import VehicleState
-    from drocap_ros.observation import PoseObservation
     from drocap_ros.perception.sources.image_files import encode_jpeg
     from drocap_ros.ros.conversions import header_at, pose2d_to_ros
     from drocap_ros.ros.topics import TOPICS

@@ -29,7 +29,7 @@ myst_heading_anchors = 3  # [text](page.md#heading), as GitHub has it
 
 #: Rooms whose functions and types a script uses; docs/api.md names the first ones.
 _REFERENCE = (
-    "api motion tracks clip keypoints observation skeleton contacts config parameters errors pipeline"
+    "api motion tracks clip keypoints skeleton contacts config parameters errors pipeline"
     " open_images bringup geometry evaluation export recording reconstruction/methods reconstruction/common report"
 )
 _PARTS = [path for path in (ROOT / "drocap_ros").rglob("*") if path.is_file() and path.suffix in (".py", ".pyi")]

@@ -34,8 +34,6 @@ def reconstruct(  # noqa: PLR0913 - the options of the command
 
     The same arrays as ``drocap reconstruct`` with the options of the same names.
 
-    Parameters
-    ----------
     method : "ba", "paper", "paper-no-articulation", "initial", "mf-nnm", or "live" for a recording of the live graph
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     config : parameters, or their YAML file
@@ -74,8 +72,6 @@ def reconstruct(  # noqa: PLR0913 - the options of the command
 def compare(motion: Motion | str | Path, truth: Motion | str | Path) -> MotionErrors:
     """Errors of a motion against its truth: ``drocap evaluate compare``.
 
-    Parameters
-    ----------
     motion : a motion, its file or folder
     truth : a motion, or a file of a motion or of MoCap, or a folder with ``truth.npz`` or ``motion.npz``
     """

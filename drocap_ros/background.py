@@ -137,8 +137,6 @@ def of_images(images: Iterable[FixedPoints | None], most_rows: int = MOST_ROWS) 
 class PointHistory:
     """Fixed points of the last images of a live stream, by their stamps; the same messages give the same answers.
 
-    Parameters
-    ----------
     keep_s : age, before the newest image with points, up to which they are kept
     """
 

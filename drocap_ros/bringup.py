@@ -61,8 +61,6 @@ def bringup(
 ) -> Iterator[Graph]:
     """Run the named nodes while the context lasts.
 
-    Parameters
-    ----------
     config : parameters of every component
     nodes : names out of ``ros.topics.NODES``
     processes : one process each (True), or all in this one, a thread each: for small machines, tests and scripts; the
@@ -74,12 +72,7 @@ def bringup(
     respawn : restart a node that dies once the graph runs, after a growing pause, at most ``graph.MOST_RESTARTS``
         times a minute; ``Graph.events`` and ``/diagnostics`` report it
 
-    Raises
-    ------
-    InputError
-        When a node is unknown or refuses its parameters.
-    NodeError
-        When the endpoints are not matched in time, or a node fails.
+    Raises NodeError when the endpoints are not matched in time, or a node fails.
     """
     names = [name for name in NODES if name in nodes]
     unknown = sorted(set(nodes) - set(NODES))
@@ -137,15 +130,10 @@ def lockstep(
 
     The caller adds its own endpoints to ``Lockstep.node`` and then calls ``Lockstep.start``.
 
-    Parameters
-    ----------
     config, nodes : as of :func:`bringup`; the DDS domain is a free one
     transports : simulated ends of MAVLink links, by the nodes that own them
 
-    Raises
-    ------
-    InputError, NodeError
-        When a node refuses its parameters or fails.
+    Raises NodeError when a node refuses its parameters or fails.
     """
     names = [name for name in NODES if name in nodes]
     overrides = [Parameter("use_sim_time", value=True), Parameter("graph_nodes", value=",".join(names))]

@@ -60,8 +60,6 @@ _SHORTEST_SPAN_S = 0.2  # the latter
 class RestingFeet:
     """Probability that ankles and toes of one window rest; joints and floor change while they are adjusted.
 
-    Parameters
-    ----------
     seen : (F, P) bool, of the joints; a toe or an ankle that no network sees is the lifter's guess and holds no foot
     fps : frames per second
     looks : (F, 2) the lifter's probability that the right and the left foot rest; None = unknown
@@ -85,8 +83,6 @@ class RestingFeet:
     def probability(self, joints: np.ndarray, floor: float, speed_std_m_s: float, moving: float = MOVING) -> np.ndarray:
         """(F - 1, 4) for each step between two frames of each of ``FEET``.
 
-        Parameters
-        ----------
         joints : (F, P, 3) m, z up
         floor : m, height of a resting ankle
         speed_std_m_s : of a foot in contact, as far as the present joints are accurate

@@ -1,10 +1,14 @@
-"""2D keypoints of one person with their uncertainty: the one type that perception hands to reconstruction."""
+"""2D keypoints with their uncertainty: of one person over time, and what perception finds in one image."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+
+from drocap_ros.background import FixedPoints
+from drocap_ros.errors import InputError
+from drocap_ros.skeleton import BODY_15, BODY_17, JointSet, body_set
 
 
 @dataclass(frozen=True)
@@ -67,3 +71,56 @@ class Keypoints2D:
     def variance(self) -> np.ndarray | None:
         """(F, P) px^2 per coordinate, the mean of xx and yy; None without a covariance."""
         return None if self.covariance is None else 0.5 * (self.covariance[..., 0] + self.covariance[..., 2])
+
+
+def _empty(*shape: int) -> np.ndarray:
+    return np.empty(shape, np.float32)
+
+
+@dataclass(frozen=True)
+class PoseObservation:
+    """The subject in one image; P joints, or empty arrays without a subject.
+
+    stamp_ns : exposure time of the image
+    track_id : 1, 2, ... for the subject; 0 = no subject
+    joints : names and order of the keypoints
+    image_size : (width, height) px
+    roi : (4,) float32, the subject's box x_min y_min x_max y_max px; NaN without a subject
+    detection_score : the detector's score of the box in [0, 1], the last one while the box is propagated by the pose
+        network; 0 for a predicted box
+    keypoints : (P, 2) float32 px, NaN = not seen
+    covariance : (P, 3) float32 px^2, xx xy yy, NaN where the keypoint is
+    confidence : (P,) float32 in [0, 1], calibrated: the share of such keypoints within 10 % of the box height of a
+        human label
+    background : fixed points of the scene; None = the image was not searched for them
+    space : (P, 3) float32 m, the joints in space as a network sees them in the person's crop: x right, y down, z away
+        along the ray to the person; None = no network gives it
+    """
+
+    stamp_ns: int
+    track_id: int
+    image_size: tuple[int, int]
+    joints: JointSet = BODY_15
+    roi: np.ndarray = field(default_factory=lambda: np.full(4, np.nan, np.float32))
+    detection_score: float = 0.0
+    keypoints: np.ndarray = field(default_factory=lambda: _empty(0, 2))
+    covariance: np.ndarray = field(default_factory=lambda: _empty(0, 3))
+    confidence: np.ndarray = field(default_factory=lambda: _empty(0))
+    background: FixedPoints | None = None
+    space: np.ndarray | None = None
+
+    @property
+    def has_subject(self) -> bool:
+        """Whether the image has a subject."""
+        return self.track_id > 0
+
+    def body_keypoints(self) -> Keypoints2D:
+        """The image's keypoints of ``BODY_17``, float64; toes that the network does not give are NaN."""
+        if not body_set(self.joints):
+            raise InputError(f"skeleton: expected body15, body17 or body19, got {self.joints.name}; map the joints")
+        for name, columns in (("keypoints", (2,)), ("confidence", ()), ("covariance", (3,))):
+            shape, expected = getattr(self, name).shape, (len(self.joints), *columns)
+            if shape != expected:
+                raise InputError(f"{name}: expected shape {expected}, got {shape}; use the {self.joints.name} joints")
+        arrays = (values.astype(np.float64) for values in (self.keypoints, self.confidence, self.covariance))
+        return Keypoints2D(*arrays).with_joints(len(BODY_17))

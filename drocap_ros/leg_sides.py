@@ -34,8 +34,6 @@ _EXCHANGED_CONFIDENCE = 0.85
 def with_own_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.ndarray) -> Keypoints2D:
     """Keypoints with the legs exchanged back in the images in which the network most likely exchanged them.
 
-    Parameters
-    ----------
     keypoints : of ``BODY_15``, ``BODY_17`` or ``BODY_19``, px
     stamp_ns : (F,)
     box_size : (F,) px, longer side of the person's box

@@ -13,9 +13,8 @@ import numpy as np
 from drocap_ros.clip import Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
-from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.keypoints import Keypoints2D, PoseObservation
 from drocap_ros.motion import Motion
-from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.poses import NO_WINDOW
 from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses

@@ -44,13 +44,7 @@ def param(
 
 @dataclass(frozen=True)
 class Parameters:
-    """Base of all component parameters: bool, int, float or str fields made with :func:`param`.
-
-    Raises
-    ------
-    ParameterError
-        At construction, when a value has the wrong type or lies outside its range.
-    """
+    """Base of all component parameters: bool, int, float or str fields made with :func:`param`."""
 
     def __post_init__(self) -> None:
         types = _types(type(self))  # type: ignore[arg-type]  # a class is hashable

@@ -14,8 +14,8 @@ import numpy as np
 from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.motion import Motion
-from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import open_images
 from drocap_ros.parameters import Values
 from drocap_ros.perception.load_models import models_folder

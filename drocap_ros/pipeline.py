@@ -1,4 +1,4 @@
-"""Any input to a motion: the offline path, with the same core as the nodes."""
+"""Any input to a motion: the offline path, with the same core as the nodes; several recordings of one person to one."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pathlib import Path
 from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.motion import Motion
-from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import open_images, refuse_other_inputs
 from drocap_ros.parameters import Values
 from drocap_ros.perception.estimator import PoseEstimator
@@ -25,6 +25,8 @@ from drocap_ros.perception.people import FoundPerson, find_persons, following, i
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.reconstruction.reconstruct import Solved, solve
+from drocap_ros.reconstruction.together.joined import join_views
 from drocap_ros.recording.evidence import with_evidence
 from drocap_ros.recording.image_messages import choose_images
 from drocap_ros.recording.open_session import is_recording, open_session
@@ -86,8 +88,6 @@ def reconstruct_input(
 ) -> tuple[Motion, Tracks]:
     """Motion of the subject in a video file, image folder, recording or tracks file.
 
-    Parameters
-    ----------
     path : video, folder of images, ``.mcap``, rosbag1 ``.bag``, rosbag2 folder, or tracks ``.npz``
     method : one of :data:`drocap_ros.reconstruction.methods.METHODS`, or "live": the sliding windows of the live
         graph on a recording with ``pose2d``, with the recorded parameters unless ``config`` differs from the defaults
@@ -291,3 +291,35 @@ def _load_reconstruction(lifter: str) -> None:
 def _log_warnings(session: Session) -> None:
     for warning in session.warnings:
         logger.warning("%s: %s", session.path.name, warning)
+
+
+def reconstruct_together(
+    paths: list[Path],
+    *,
+    config: DrocapConfig,
+    telemetry: Telemetry,
+    models: Path | None = None,
+    progress: Progress | None = None,
+    threads: int = 0,
+) -> list[tuple[Motion, Tracks]]:
+    """The one motion that several recordings of a person show, as each recording's camera sees it, and their tracks.
+
+    paths : inputs of :func:`reconstruct_input`, two at least; the times of the first one's images are those of all
+    telemetry : none, or that which the recordings have with them
+    """
+    solved: list[Solved] = []
+    read: list[tuple[Path, Values, float]] = []
+    tracks: list[Tracks] = []
+    for path in paths:
+        begin = time.perf_counter()
+        own, origin = input_tracks(path, config, models, progress, telemetry, Selection(threads=threads))
+        read.append((path, origin, time.perf_counter() - begin))
+        tracks.append(own)
+        solved.append(solve(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress))
+    begin = time.perf_counter()
+    motions = join_views(solved, [path.name for path in paths])
+    took = time.perf_counter() - begin
+    for motion in motions:
+        alone = motion.meta["seconds"]
+        motion.meta["seconds"] = {**alone, "together": took, "total": alone["total"] + took}
+    return [(with_origin(motion, *of), own) for motion, of, own in zip(motions, read, tracks, strict=True)]

@@ -14,7 +14,7 @@ import numpy as np
 
 from drocap_ros.background import Background, read_background
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.geometry.pinhole import MOST_ASPECT, pixels_are_usual
+from drocap_ros.geometry.rotations import MOST_ASPECT, pixels_are_usual
 from drocap_ros.stamps import as_stamps, check_stamps
 
 #: Longest accepted sequence (10 h at 30 fps); longer ones are refused before memory runs out.

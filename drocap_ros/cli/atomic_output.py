@@ -50,12 +50,7 @@ def check_output_folder(target: Path) -> None:
 def output_folder(target: Path) -> Iterator[Path]:
     """A temporary folder; its files are moved to ``target`` together when the block succeeds.
 
-    Raises
-    ------
-    InputError
-        When the target is a file, or cannot be written.
-    DrocapError
-        When the disk is full.
+    Raises DrocapError when the disk is full.
     """
     check_output_folder(target)
     real = Path(os.path.realpath(target))
@@ -94,12 +89,7 @@ def output_file(target: Path, inputs: Iterable[str | Path | None] = (), option: 
 
     An existing file is replaced, of a link the file that it names.
 
-    Raises
-    ------
-    InputError
-        When the target is one of ``inputs`` or no regular file, or cannot be written.
-    DrocapError
-        When the disk is full.
+    Raises DrocapError when the disk is full.
     """
     check_output_file(target, option)
     refuse_inputs([target], inputs, option)

@@ -215,8 +215,6 @@ _LIST = ".txt"
 def read_inputs(words: Iterable[str], defaults: argparse.Namespace) -> list[argparse.Namespace]:
     """Arguments of ``drocap reconstruct``, one set per recording.
 
-    Parameters
-    ----------
     words : lists (``.txt``), folders, glob patterns and recordings
     defaults : options of ``reconstruct``; a line of a list may change them
     """

@@ -277,12 +277,7 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Generator[Record, Non
 
     The scheduler moves the recordings of a lost worker to another one, up to its ``allowed-failures`` (3) times.
 
-    Raises
-    ------
-    InputError
-        When dask.distributed is not installed, or no scheduler answers.
-    DrocapError
-        When the scheduler is lost.
+    Raises DrocapError when the scheduler is lost.
     """
     try:
         from distributed import Client, KilledWorker, as_completed

@@ -12,7 +12,7 @@ from drocap_ros.cli.options import Subparsers, add_command, add_quiet_option, ta
 from drocap_ros.errors import DrocapError, InputError
 
 if TYPE_CHECKING:
-    from drocap_ros.observation import PoseObservation
+    from drocap_ros.keypoints import PoseObservation
     from drocap_ros.perception.models.fetch import KnownModel
 
 

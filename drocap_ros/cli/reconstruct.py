@@ -266,11 +266,10 @@ def run_together(args: argparse.Namespace) -> int:
     from drocap_ros.cli.running import progress_bars
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.pipeline import needs_networks
+    from drocap_ros.pipeline import needs_networks, reconstruct_together
     from drocap_ros.recording.keypoints.files import as_tracks_file
     from drocap_ros.recording.video_telemetry import Telemetry
     from drocap_ros.report.motion_images import ImagesBeside, has_images
-    from drocap_ros.together import reconstruct_together
 
     inputs = [args.input, *args.further]
     _check(args, inputs)

@@ -23,7 +23,7 @@ from drocap_ros.errors import InputError
 if TYPE_CHECKING:
     from drocap_ros.clip import Progress
     from drocap_ros.config import DrocapConfig
-    from drocap_ros.observation import PoseObservation
+    from drocap_ros.keypoints import PoseObservation
     from drocap_ros.perception.sources import Frame
     from drocap_ros.pipeline import Selection
 

@@ -60,8 +60,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw the input."""
     from drocap_ros.report.motion_images import each_image
-    from drocap_ros.view.motion_view import Scene, draw_motion
-    from drocap_ros.view.rerun_output import new_recording
+    from drocap_ros.view.motion_view import Scene, draw_motion, new_recording
 
     _check(args)
     recording = new_recording(args.input.absolute().name or "input")
@@ -111,8 +110,7 @@ def _check(args: argparse.Namespace) -> None:
 @contextlib.contextmanager
 def _shown(recording: rerun.RecordingStream, args: argparse.Namespace) -> Iterator[None]:
     """Take what is drawn inside to the file, window or browser that the user wants."""
-    from drocap_ros.view.motion_view import layout
-    from drocap_ros.view.rerun_output import has_screen, to_browser, to_file, to_window
+    from drocap_ros.view.motion_view import has_screen, layout, to_browser, to_file, to_window
 
     arranged = layout()
     if args.save is not None:

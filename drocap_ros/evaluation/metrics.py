@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.contacts import TRUE_REST_M_S, step_speed
-from drocap_ros.geometry.alignment import apply_similarity, similarity
-from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.alignment import apply_similarity, limb_lengths, similarity
+from drocap_ros.geometry.rotations import unpack_covariance
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, indices
 
 #: The groups of the paper's table of errors per joint.

@@ -301,8 +301,6 @@ def load_mocap(
     Toes are further joints of ``X``, or the array ``toes`` (T, 2, 3) with their names in ``toe_joints``.  Where
     ``toe_kind`` is "ball", the array holds the balls of the feet, which are no joints of the body.
 
-    Parameters
-    ----------
     required : joints that the file must hold; others that it lacks are NaN
     joints : ``BODY_15`` or ``BODY_17``, those of the result
     """

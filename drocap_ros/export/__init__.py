@@ -41,8 +41,6 @@ def export(
 ) -> tuple[str, ...]:
     """Write a motion, or the motion of a file or folder, to a file of another format.
 
-    Parameters
-    ----------
     form : one of :data:`FORMATS`; None: the ending of ``path``
     names : joint names of BVH and glTF, one of :data:`drocap_ros.export.rig.NAMES`; None: "h36m"
     rest : rest pose of BVH and glTF, one of :data:`drocap_ros.export.rig.RESTS`; None: "t"

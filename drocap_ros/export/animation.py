@@ -25,8 +25,6 @@ _FORMAT = "%.5f"
 def write_bvh(path: Path, take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[str, ...]:
     """Write a BVH file; returns notes on changes.
 
-    Parameters
-    ----------
     take : z-up; it is resampled to a constant rate, and its gaps are interpolated
     names, rest : as of :func:`~drocap_ros.export.rig.rig_of`
     """
@@ -92,8 +90,6 @@ _MAX_BYTES = 2**32 - 2**20
 def write_glb(path: Path, take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[str, ...]:
     """Write a GLB file of a z-up take; returns notes on changes.
 
-    Parameters
-    ----------
     names, rest : as of :func:`~drocap_ros.export.rig.rig_of`
     """
     if len(take.positions) * len(BODY) * 16 > _MAX_BYTES:

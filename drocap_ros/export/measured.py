@@ -122,8 +122,6 @@ def write_csv_angles(path: Path, take: Take) -> tuple[str, ...]:
 def joint_angles(body: RigidBody, rate_hz: float) -> dict[str, np.ndarray]:
     """Name -> (F,) degrees, continuous over time, signs as in docs/export.md.
 
-    Parameters
-    ----------
     rate_hz : frames per second
     """
     pelvis, chest = body.pelvis @ _ISB, body.chest @ _ISB

@@ -89,8 +89,6 @@ class Rig:
 def rig_of(take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tuple[str, ...]]:
     """Rig of a take, and notes on the changes.
 
-    Parameters
-    ----------
     take : y up; gaps are interpolated
     names : one of :data:`NAMES`
     rest : one of :data:`RESTS`

@@ -87,8 +87,6 @@ def fit_rigid_body(
 ) -> RigidBody:
     """Rigid body of a motion.
 
-    Parameters
-    ----------
     positions : (F, P, 3) m, y up, without NaN
     joints : P names, those of ``BODY_15`` at least; ``rtoe``, ``ltoe`` are used, others are ignored
     known : (F, P) bool, False where a position was interpolated

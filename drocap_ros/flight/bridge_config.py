@@ -152,14 +152,7 @@ LEAST_REVERSAL_S = 10.0  # a turn takes two ramps
 
 @dataclass(frozen=True)
 class OrbitConfig(Parameters):
-    """The orbit that is flown unless a command changes it, and the limits of every orbit.
-
-    Raises
-    ------
-    ParameterError
-        Also when the values contradict each other: an orbit inside the minimum distance, or one that needs more
-        speed or acceleration than allowed.
-    """
+    """The orbit that is flown unless a command changes it, and the limits of every orbit."""
 
     radius_m: float = param(6.0, "horizontal distance from the subject", "m", 0, 100)
     height_m: float = param(2.5, "height above the subject's ground", "m", 0, 100)

@@ -1,11 +1,31 @@
-"""Alignment of point sets and the body-fixed torso frame."""
+"""Alignment of point sets, the body-fixed torso frame, lengths of bones and what they say of the stature."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from drocap_ros.geometry.rotations import project_to_so3
-from drocap_ros.skeleton import BODY_15, JointSet
+from drocap_ros.skeleton import BODY_15, BODY_17, RIGID_BONES, JointSet, indices
+
+#: Sum of the ten rigid limb lengths over stature: 1.876 over the head joint's standing height on the native CMU
+#: skeletons of the training set; that joint lies about 9 cm below the top of the head.
+LIMBS_PER_STATURE = 1.78
+_RIGID_ENDS = np.array([indices(BODY_15.joints, bone) for bone in RIGID_BONES])
+
+
+def pair_lengths(joints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Distances (..., L) over pairs (L, 2) of the joints (..., P, D)."""
+    return np.asarray(np.linalg.norm(joints[..., pairs[:, 1], :] - joints[..., pairs[:, 0], :], axis=-1))
+
+
+def bone_lengths(joints: np.ndarray) -> np.ndarray:
+    """Length (..., P - 1) of every bone of poses (..., P, D) of BODY_15 or BODY_17: that of joint j stands at j - 1."""
+    return pair_lengths(joints, BODY_17.bones[: joints.shape[-2] - 1])
+
+
+def limb_lengths(poses: np.ndarray) -> np.ndarray:
+    """Length (..., 10) of each of :data:`~drocap_ros.skeleton.RIGID_BONES` of poses (..., P, 3), BODY_15 first."""
+    return pair_lengths(poses, _RIGID_ENDS)
 
 
 def similarity(
@@ -13,8 +33,6 @@ def similarity(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Best similarity transformation without reflection (Umeyama 1991), per leading index.
 
-    Parameters
-    ----------
     source, target : (..., P, 3)
     with_scale : False for a rigid motion
 
@@ -49,8 +67,6 @@ def apply_similarity(
 def torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:
     """Body-fixed frame of each pose: x forward, y left, z up along the trunk.
 
-    Parameters
-    ----------
     s : (..., P, 3), any right-handed frame and unit
 
     Returns
@@ -78,8 +94,6 @@ def unit_or(v: np.ndarray, fallback: np.ndarray) -> np.ndarray:
 def to_torso_frame(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split poses into body-fixed shapes and the rotation of the body.
 
-    Parameters
-    ----------
     s : (..., P, 3) of BODY_15, for example in the camera's frame
 
     Returns

@@ -8,8 +8,7 @@ import numpy as np
 
 from drocap_ros.camera_path import CameraPath, Teller
 from drocap_ros.geometry.interpolation import MAX_GAP_S, interpolate
-from drocap_ros.geometry.pinhole import pixels_are_usual
-from drocap_ros.geometry.rotations import matrix_from_quaternion, unit_quaternions
+from drocap_ros.geometry.rotations import matrix_from_quaternion, pixels_are_usual, unit_quaternions
 
 #: Poses kept: the longest window at 100 Hz.
 _MOST_POSES = 15_000
@@ -25,8 +24,6 @@ _GAP_NS = round(MAX_GAP_S * 1e9)
 class CameraHistory:
     """Takes reported poses and calibrations in the order of their arrival; the same order gives the same answers.
 
-    Parameters
-    ----------
     keep_s : length of the longest window
     """
 

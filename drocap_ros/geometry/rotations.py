@@ -1,4 +1,7 @@
-"""Rotation matrices, rotation vectors and quaternions (xyzw, Hamilton), batched over leading axes."""
+"""Rotation matrices, rotation vectors and quaternions (xyzw, Hamilton), covariances as ellipsoids, pinholes.
+
+All are batched over leading axes.
+"""
 
 from __future__ import annotations
 
@@ -173,3 +176,58 @@ def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         aw * bw - (ax * bx + ay * by + az * bz),
     ]
     return np.array(parts, np.result_type(a, b)) if single else np.stack(parts, axis=-1)
+
+
+#: Least squared half axis: smaller ones are invisible.
+_SMALLEST_M2 = 1e-8
+
+
+def unpack_covariance(packed: np.ndarray) -> np.ndarray:
+    """Symmetric matrices (..., 3, 3) of xx xy xz yy yz zz (..., 6)."""
+    return packed[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*packed.shape[:-1], 3, 3)
+
+
+def pack_covariance(matrix: np.ndarray) -> np.ndarray:
+    """Elements xx xy xz yy yz zz (..., 6) of symmetric matrices (..., 3, 3)."""
+    packed: np.ndarray = matrix[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return packed
+
+
+def ellipsoids(covariance: np.ndarray, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+    """Orientation (N, 4) x y z w and half axes (N, 3) m of the ellipsoids of covariances (N, 3, 3) m^2."""
+    variances, axes = np.linalg.eigh(covariance)
+    axes[np.linalg.det(axes) < 0, :, 0] *= -1.0  # a rotation, not a reflection
+    return quaternion_from_matrix(axes), sigmas * np.sqrt(np.maximum(variances, _SMALLEST_M2))
+
+
+#: Focal length of a lens of which nothing is known, share of the image's longer side: ``assumed_focal`` says why.
+ASSUMED_FOCAL = 0.85
+
+
+#: Ratio of the focal lengths up to which a matrix is one of a lens: anamorphic ones squeeze by two.
+MOST_ASPECT = 4.0
+
+
+def pixels_are_usual(matrix: np.ndarray) -> bool:
+    """Whether the focal lengths of a matrix (3, 3) belong to one lens."""
+    fx, fy = np.diagonal(matrix)[:2].tolist()
+    return bool(0.0 < max(fx, fy) <= MOST_ASPECT * min(fx, fy))
+
+
+def centred_camera(size: tuple[int, int], focal_px: float) -> np.ndarray:
+    """Camera matrix (3, 3) px of images of ``size`` (width, height); pixel 0 has its centre at 0, as in OpenCV."""
+    matrix = np.diag([focal_px, focal_px, 1.0])
+    matrix[:2, 2] = (np.array(size) - 1) / 2
+    return matrix
+
+
+def assumed_camera(size: tuple[int, int]) -> np.ndarray:
+    """Camera matrix (3, 3) px of images of ``size`` (width, height) of which nothing is known."""
+    return centred_camera(size, ASSUMED_FOCAL * max(size))
+
+
+def towards(ray: np.ndarray) -> np.ndarray:
+    """(F, 3, 3) least turns that bring rays (F, 2), x and y at depth 1, to the axis."""
+    length = np.linalg.norm(ray, axis=-1)
+    angle = np.arctan(length) / np.maximum(length, 1e-12)
+    return exp_so3(np.stack([ray[:, 1] * angle, -ray[:, 0] * angle, np.zeros(len(ray))], axis=-1))

@@ -20,8 +20,8 @@ from std_msgs.msg import Header
 from drocap_ros.background import PointHistory
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D
-from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin, StreamEvent

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.nms import overlap_coefficient
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel, FeetModel
 from drocap_ros.perception.tracking.appearance import describe, limb_colours

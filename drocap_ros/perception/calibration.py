@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.geometry.pinhole import centred_camera
+from drocap_ros.geometry.rotations import centred_camera
 from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.tracks import check_camera_matrix
 

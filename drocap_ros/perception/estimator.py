@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import without_parts
 from drocap_ros.perception.load_models import limited_use, load_detector, load_feet_model, load_pose_model
@@ -39,8 +39,6 @@ log = logging.getLogger(__name__)
 class PoseEstimator:
     """Follows one person through the images of one camera; equal images give equal results.
 
-    Parameters
-    ----------
     models_dir : folder with a person detector and a 2D pose model (``.onnx``)
     config : models, thresholds, choice of the subject
     """
@@ -93,8 +91,6 @@ class PoseEstimator:
     ) -> PoseObservation:
         """The subject in one image.
 
-        Parameters
-        ----------
         image : (H, W, 3) uint8 BGR
         stamp_ns : exposure time; one earlier than the last image's resets the tracker, with a warning
         roi : (4,) x_min y_min x_max y_max px, box of the drone's own tracker, or a user's choice

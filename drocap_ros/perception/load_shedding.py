@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.models.network_input import shrink
 
 _SIDE_PX = 192  # longer side of the box in the flow's image; smaller boxes are not enlarged

@@ -14,7 +14,7 @@ import numpy as np
 from drocap_ros.background import FixedPoints, of_images
 from drocap_ros.clip import Clip
 from drocap_ros.errors import InputError
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.bodies import Bodies, Body
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.pose.body_pose import BodyPoseModel

@@ -10,10 +10,9 @@ import numpy as np
 
 from drocap_ros.background import MOST_ROWS, of_images
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.pinhole import assumed_camera, towards
-from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.geometry.rotations import assumed_camera, towards
+from drocap_ros.keypoints import Keypoints2D, PoseObservation
 from drocap_ros.leg_sides import with_own_legs
-from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.sources.base import Frame, prefetch, with_next
 from drocap_ros.tracks import Tracks
@@ -31,8 +30,6 @@ def observe(
     With two or more, one decodes ahead and one follows the scene of the next image, and runs the detector in it where
     this image needed it, while this one estimates the pose: each of them needs its own result of the last image.
 
-    Parameters
-    ----------
     frames : a source, or frames in the order of time
     estimator : a fresh one; it keeps its subject between calls
     on_frame : called with each frame and its observation, for progress and overlays

@@ -49,8 +49,6 @@ def balanced(poses: ImagePoses, rotation: np.ndarray, stamp_ns: np.ndarray) -> I
 
     Depths are sheared along the image's upright; places in the image stay.
 
-    Parameters
-    ----------
     poses : of a camera that looks at the person, in the middle of an upright image
     rotation : (F, 3, 3) world (z up) -> camera
     stamp_ns : (F,)

@@ -41,8 +41,6 @@ def foot_axes(joints: np.ndarray) -> np.ndarray:
 def heel_place(image_joints: np.ndarray, heels: Keypoints2D) -> tuple[np.ndarray, float]:
     """Place (2,) of the heels by :func:`foot_axes`, and the RMS error in the image over the foot's length.
 
-    Parameters
-    ----------
     image_joints : (F, 17, 3) px, x and y in the image
     heels : (F, 2) keypoints, right and left, at least one of them seen
     """
@@ -66,8 +64,6 @@ def heel_place(image_joints: np.ndarray, heels: Keypoints2D) -> tuple[np.ndarray
 def with_heels(motion: Motion, heels: Keypoints2D, image_joints: np.ndarray) -> Motion:
     """The motion of ``BODY_17`` with the heels, ``BODY_19``; unchanged when no image shows one.
 
-    Parameters
-    ----------
     heels : (F, 2) keypoints, right and left
     image_joints : (F, 17, 3) px, the adjusted joints, x and y in the image
     """

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drocap_ros.geometry.pinhole import centred_camera, towards
-from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.geometry.rotations import centred_camera, exp_so3, towards
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.lifter_input import centre_of
@@ -100,8 +99,6 @@ def person_view(
 ) -> PersonView | None:
     """The view of a sequence; None where neither lens nor attitude of the camera is known: the image itself.
 
-    Parameters
-    ----------
     keypoints : (F, P) px in the image, of a body set of 17 joints at most
     matrix : (3, 3) px of the camera; None = unknown
     rotation : (F, 3, 3) world (z up) -> camera; None = unknown

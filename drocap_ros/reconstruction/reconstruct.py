@@ -69,8 +69,6 @@ def reconstruct(
 ) -> Motion:
     """3D motion of the subject of ``tracks``.
 
-    Parameters
-    ----------
     tracks : joints by the names of BODY_17 or of a set in :mod:`drocap_ros.skeleton`, COCO for one; the model
         estimates missing ones, others are ignored
     method : a name in :data:`~drocap_ros.reconstruction.methods.METHODS`

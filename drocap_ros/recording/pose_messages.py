@@ -11,7 +11,7 @@ from drocap_ros.background import Background, FixedPoints, of_images
 from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle import optical_orientation
 from drocap_ros.geometry.camera_history import CameraHistory
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.recording.session import Message, calibration_of, header_stamp_ns, xyzw_of
 from drocap_ros.skeleton import joint_set
 from drocap_ros.stamps import StampValidator

@@ -33,8 +33,6 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
     Images without that subject are frames of NaN.  The tracks contain the camera's poses where the recording does, see
     :func:`drocap_ros.recording.telemetry.camera_poses.camera_poses`.  Missing parts are in ``session.warnings``.
 
-    Parameters
-    ----------
     mount_pitch_deg : of a camera fixed to the body, negative down, for recordings without the camera's attitude
     telemetry : whether the states of the vehicle are used
     """

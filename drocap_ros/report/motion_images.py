@@ -16,8 +16,8 @@ import numpy as np
 from drocap_ros.clip import Progress
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.interpolation import usual_step
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.motion import Motion
-from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import Images, open_images
 from drocap_ros.perception.models.network_input import shrink
 from drocap_ros.perception.sources import Frame

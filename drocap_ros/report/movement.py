@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.rotations import unpack_covariance
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.report.statistics import Statistics
 from drocap_ros.skeleton import indices
@@ -23,8 +23,6 @@ _CHAINS = {"knee": ("hip", "knee", "ankle"), "elbow": ("shoulder", "elbow", "wri
 def flexion(joints: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """(F, 2) degrees of the right and the left knee, hip and elbow; NaN where a joint is.
 
-    Parameters
-    ----------
     joints : (F, P, 3), any unit and frame
     names : (P,) of the joints
     """

@@ -164,8 +164,6 @@ def save_report(
 ) -> bool:
     """Write the report of a motion; returns whether it holds images.
 
-    Parameters
-    ----------
     video : source of the motion, for its images
     images : those of the motion, where they were read already
     former : report whose images are kept, where there are no others and it shows the same keypoints; it may be missing

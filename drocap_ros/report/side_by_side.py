@@ -11,8 +11,8 @@ import numpy as np
 from drocap_ros.clip import Progress
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.report.motion_images import Box, FollowingBox, each_image
+from drocap_ros.report.overlay import VideoFile
 from drocap_ros.report.statistics import Statistics, motion_statistics, smooth
-from drocap_ros.report.video_file import VideoFile
 from drocap_ros.skeleton import side_of
 
 #: Sides of both panes, px.
@@ -43,12 +43,7 @@ def save_side_by_side(path: Path, motion: Motion, video: Path, progress: Progres
     video : source of the motion
     progress : takes the stage's name and its share
 
-    Raises
-    ------
-    InputError
-        When the motion holds no pose, or the video cannot be used.
-    DrocapError
-        When the file cannot be written.
+    Raises DrocapError when the file cannot be written.
     """
     pictures = _pictures(motion, video, progress)
     first, rate_hz = next(pictures)

@@ -16,8 +16,8 @@ from std_msgs.msg import Header
 from drocap_ros.background import FixedPoints
 from drocap_ros.flight.vehicle import VehicleState as VehicleStateData
 from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
-from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.reconstruction.live.latest_pose import PlacedPose
 from drocap_ros.reconstruction.live.window import AdjustedWindow

@@ -224,10 +224,7 @@ class Graph:
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str = "the condition") -> None:
         """Run the script's own callbacks until ``condition()`` holds.
 
-        Raises
-        ------
-        NodeError
-            When that takes longer than ``timeout_s``, or a node failed meanwhile.
+        Raises NodeError when that takes longer than ``timeout_s``, or a node failed meanwhile.
         """
         if not self.wait(condition, timeout_s):
             raise NodeError(f"waited {timeout_s:g} s for {what}; it did not come")

@@ -75,10 +75,7 @@ class ManagedComponent(ComponentNode, LifecycleNodeMixin):
     def acquire(self) -> None:
         """Take the resource.
 
-        Raises
-        ------
-        DrocapError
-            When it is not available; the node then stays unconfigured.
+        Raises DrocapError when it is not available; the node then stays unconfigured.
         """
 
     def begin(self) -> None:

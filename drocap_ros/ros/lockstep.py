@@ -103,10 +103,7 @@ class Lockstep:
     def run_until(self, condition: Callable[[], bool], limit_s: float, what: str) -> None:
         """Step until ``condition()`` holds.
 
-        Raises
-        ------
-        NodeError
-            When that takes more than ``limit_s`` of simulated time.
+        Raises NodeError when that takes more than ``limit_s`` of simulated time.
         """
         end = self.steps + round(limit_s / STEP_S)
         while not condition():

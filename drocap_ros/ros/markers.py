@@ -12,10 +12,9 @@ from std_msgs.msg import ColorRGBA, Header, String
 from visualization_msgs.msg import ImageMarker, Marker, MarkerArray
 
 from drocap_ros.geometry.alignment import torso_frame
-from drocap_ros.geometry.ellipsoids import ellipsoids, unpack_covariance
-from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.geometry.rotations import ellipsoids, quaternion_from_matrix, unpack_covariance
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import Pose2D, Pose3D
-from drocap_ros.observation import PoseObservation
 from drocap_ros.recording.session import Message
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros, transform_to_ros
 from drocap_ros.ros.topics import KEPT_QOS

@@ -17,7 +17,7 @@ from typing import Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from drocap_ros.errors import NodeError
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.sources.image_files import decoded
@@ -138,10 +138,7 @@ class OwnProcess(Generic[_P, _R]):
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         """The result of a call, or its error; one thread calls at a time.
 
-        Raises
-        ------
-        NodeError
-            When the process has died.
+        Raises NodeError when the process has died.
         """
         result: _R
         try:

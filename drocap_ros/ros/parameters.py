@@ -26,13 +26,7 @@ _DECLARED_LATER = ("autostart", "graph_running")
 
 
 def declare_parameters(node: Node, defaults: P) -> P:
-    """Declare every field of ``defaults`` on the node and return the values after ROS's overrides.
-
-    Raises
-    ------
-    ParameterError
-        When an override is unknown, has the wrong type or lies outside its range.
-    """
+    """Declare every field of ``defaults`` on the node and return the values after ROS's overrides."""
     known = {*_DECLARED_LATER, *(spec.name for spec in dataclasses.fields(defaults))}
     for name in sorted(set(overridden_parameters(node)) - known):  # ROS ignores unknown ones
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):

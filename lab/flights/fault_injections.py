@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.orbit.states import Action, Command, OperatorCommand, State
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup, Readiness
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport, is_setpoint

@@ -24,7 +24,7 @@ from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
 from drocap_ros.flight.orbit.states import Action, Command, CommandAnswer, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.vehicle import camera_rotation
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.simulation.orbit_camera import project
 from drocap_ros.simulation.render.renderer import Renderer

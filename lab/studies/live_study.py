@@ -12,8 +12,8 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.observation import PoseObservation
+from drocap_ros.geometry.alignment import limb_lengths
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses

@@ -14,7 +14,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.evaluation.compare import compare
 from drocap_ros.evaluation.metrics import JOINT_GROUPS
 from drocap_ros.evaluation.tables import RecordingRow, by_method, group_cells, label, markdown_table, plot
-from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from lab.studies.protocol import Progress, Sequence, orbit_view, reported

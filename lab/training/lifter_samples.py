@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.contacts import TRUE_REST_M_S
-from drocap_ros.geometry.bones import pair_lengths
+from drocap_ros.geometry.alignment import pair_lengths
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.common.windows import LIFTER_FPS
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, normalise

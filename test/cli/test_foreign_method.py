@@ -15,6 +15,13 @@ from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import save_tracks
 
+#: Methods that cannot run, and what is said of them.
+REFUSED = {
+    "torn": "expected ImagePoses with joints_px (30, 17, 3), found ndarray",
+    "gone": "of the package flat-body: expected the function no_such_module:run",
+    "absent": "'flat'",
+}
+
 
 @pytest.fixture(scope="module")
 def package(root, tmp_path_factory):
@@ -35,70 +42,82 @@ def package(root, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def drocap(root, package):
-    def run(*words, module="drocap_ros.cli"):
-        path = os.pathsep.join([str(package), str(root), os.environ.get("PYTHONPATH", "")])
-        command = [sys.executable, "-m", module, *map(str, words)]
-        env = {**os.environ, "PYTHONPATH": path}
-        return subprocess.run(command, capture_output=True, text=True, timeout=250, env=env)
-
-    return run
-
-
-@pytest.fixture(scope="module")
 def tracks(tmp_path_factory):
     path = tmp_path_factory.mktemp("tracks") / "walk.npz"
     save_tracks(path, simulate_capture(2.0, 15.0, seed=1).tracks)
     return path
 
 
-def test_reconstruct_runs_it(drocap, tracks, tmp_path):
-    done = drocap("reconstruct", tracks, "--method", "flat", "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    motion = load_motion(tmp_path / "out" / "motion.npz")
+#: Runs commands, those of the laboratory included, and prints the status and what each says.
+RUN = """
+import contextlib, io, json, sys
+from drocap_ros.cli import main
+from lab.commands import build_parser
+for words in json.loads(sys.argv[1]):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = main(words, parser=build_parser() if words[0] == "rotation" else None)
+    print(json.dumps([status, out.getvalue(), err.getvalue()]))
+"""
+
+
+@pytest.fixture(scope="module")
+def done(root, package, tracks, tmp_path_factory):
+    """Folder of the results, and status, output and errors of each command by its name; a process of its own."""
+    folder = tmp_path_factory.mktemp("done")
+    mocap = folder / "mocap"
+    mocap.mkdir()
+    mm = (1000 * make_walk(130).shape).astype(np.float32)
+    np.savez(mocap / "walk.npz", X=mm, fps=24.0, joints=np.array(BODY_15.joints))
+    commands = {
+        "flat": ["reconstruct", tracks, "--method", "flat", "--out", folder / "flat"],
+        "batch": ["batch", tracks, "--method", "flat", "--out", folder / "batch"],
+        "study": ["rotation", mocap, "--methods", "flat", "initial", "--speeds", "25", "--quiet"],
+        "ba": ["reconstruct", tracks, "--out", folder / "ba", "--no-report"],
+        **{name: ["reconstruct", tracks, "--method", name, "--out", folder / name] for name in REFUSED},
+    }
+    words = json.dumps([[str(word) for word in command] for command in commands.values()])
+    path = os.pathsep.join([str(package), str(root), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": path}
+    ran = subprocess.run([sys.executable, "-c", RUN, words], capture_output=True, text=True, timeout=280, env=env)
+    assert ran.returncode == 0, ran.stderr
+    return folder, dict(zip(commands, map(json.loads, ran.stdout.splitlines()), strict=True))
+
+
+def test_reconstruct_runs_it(done):
+    folder, ran = done
+    status, said, errors = ran["flat"]
+    assert status == 0, errors
+    motion = load_motion(folder / "flat" / "motion.npz")
     assert motion.meta["method"] == "flat"
     assert motion.meta["stop_reason"] == "flat"
     # Flat bodies turn with the camera: the depth along its axis is that of the pelvis.
     depth = np.einsum("fj,fpj->fp", motion.camera_rotation[:, 2], motion.joints3d - motion.joints3d[:, :1])
     across = np.ptp(motion.joints3d[..., 2], axis=1)
     assert np.abs(depth).max() < 0.2 * across.min()
-    assert "reprojection" in done.stdout
+    assert "reprojection" in said
 
 
-def test_batch_runs_it(drocap, tracks, tmp_path):
-    done = drocap("batch", tracks, "--method", "flat", "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    (line,) = (tmp_path / "out" / "batch.jsonl").read_text().splitlines()
-    motion = load_motion(tmp_path / "out" / json.loads(line)["folder"] / "motion.npz")
+def test_batch_and_a_study_run_it(done):
+    folder, ran = done
+    assert (ran["batch"][0], ran["study"][0]) == (0, 0), ran
+    (line,) = (folder / "batch" / "batch.jsonl").read_text().splitlines()
+    motion = load_motion(folder / "batch" / json.loads(line)["folder"] / "motion.npz")
     assert motion.meta["method"] == "flat"
-
-
-def test_a_study_has_its_row(drocap, tmp_path):
-    mm = (1000 * make_walk(130).shape).astype(np.float32)
-    np.savez(tmp_path / "walk.npz", X=mm, fps=24.0, joints=np.array(BODY_15.joints))
-    done = drocap("rotation", tmp_path, "--methods", "flat", "initial", "--speeds", "25", "--quiet", module="lab")
-    assert done.returncode == 0, done.stderr
-    error_mm = {cells[1].strip(): float(cells[2]) for line in done.stdout.splitlines()
+    error_mm = {cells[1].strip(): float(cells[2]) for line in ran["study"][1].splitlines()
                 if len(cells := line.split("|")) == 5 and re.fullmatch(r" \d+\.\d ", cells[2])}  # fmt: skip
     assert error_mm["flat"] > error_mm["paper: single-view initialization"] > 0
 
 
-def test_the_method_of_that_name_stays_ours(drocap, tracks, tmp_path):
-    done = drocap("reconstruct", tracks, "--out", tmp_path / "out", "--no-report")
-    assert done.returncode == 0, done.stderr
-    assert load_motion(tmp_path / "out" / "motion.npz").meta["stop_reason"] != "flat"
+def test_the_method_of_that_name_stays_ours(done):
+    folder, ran = done
+    assert ran["ba"][0] == 0, ran["ba"]
+    assert load_motion(folder / "ba" / "motion.npz").meta["stop_reason"] != "flat"
 
 
-@pytest.mark.parametrize(
-    ("method", "said"),
-    [
-        ("torn", "expected ImagePoses with joints_px (30, 17, 3), found ndarray"),
-        ("gone", "of the package flat-body: expected the function no_such_module:run"),
-        ("absent", "'flat'"),
-    ],
-)
-def test_a_method_that_cannot_run_is_refused_in_a_line(drocap, tracks, tmp_path, method, said):
-    done = drocap("reconstruct", tracks, "--method", method, "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert done.stderr.count("\n") == 1
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_method_that_cannot_run_is_refused_in_a_line(done, name):
+    status, _, errors = done[1][name]
+    assert status == 2
+    assert REFUSED[name] in errors
+    assert errors.count("\n") == 1

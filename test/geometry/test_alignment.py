@@ -6,8 +6,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from walking import make_walk
 
-from drocap_ros.geometry.alignment import apply_similarity, similarity, to_torso_frame, torso_frame
-from drocap_ros.geometry.bones import bone_lengths, limb_lengths
+from drocap_ros.geometry.alignment import (
+    apply_similarity,
+    bone_lengths,
+    limb_lengths,
+    similarity,
+    to_torso_frame,
+    torso_frame,
+)
 from drocap_ros.skeleton import BODY_15, RIGID_BONES
 
 

@@ -7,9 +7,8 @@ import pytest
 from walking import make_walk, stamps
 
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.geometry.interpolation import fill_frames, usual_step
-from drocap_ros.geometry.position_steps import without_steps
+from drocap_ros.geometry.alignment import limb_lengths
+from drocap_ros.geometry.interpolation import fill_frames, usual_step, without_steps
 from drocap_ros.recording.telemetry.camera_poses import camera_poses
 from drocap_ros.recording.telemetry.log import VehicleTrack
 

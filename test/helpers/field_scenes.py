@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix, project
 from drocap_ros.simulation.render.body import dress

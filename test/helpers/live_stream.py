@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from walking import make_walk, stamps
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 
 
 def observed(

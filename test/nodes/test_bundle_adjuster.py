@@ -13,8 +13,8 @@ from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.live_replay import reconstruct_live, recorded_config
-from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import (

@@ -44,10 +44,12 @@ for method in ("live", "ba"):
 
 
 def test_one_thread_and_two_give_the_same_arrays(captured, tmp_path):
-
+    running = []
     for threads in ("1", "2"):
         env = {**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
-        subprocess.run([sys.executable, "-c", THREADS, str(captured), str(tmp_path / threads)], check=True, env=env)
+        command = [sys.executable, "-c", THREADS, str(captured), str(tmp_path / threads)]
+        running.append(subprocess.Popen(command, env=env))
+    assert [process.wait() for process in running] == [0, 0]
     for method in ("live", "ba"):
         one, two = (np.load(tmp_path / f"{threads}_{method}.npy") for threads in ("1", "2"))
         assert np.isfinite(one).all()

@@ -10,8 +10,8 @@ from sensor_msgs.msg import CameraInfo
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.orbit.watchdog import FallbackCommands
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.nodes.mavlink_bridge import MavlinkBridgeNode
-from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.ros.conversions import camera_info_to_ros, header_at, pose2d_to_ros
 from drocap_ros.ros.topics import KEPT_QOS

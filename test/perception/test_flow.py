@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.skeleton import BODY_15

@@ -13,7 +13,7 @@ from walking import PX_PER_M, Walk, make_walk, stamps
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import horizon_error, is_mirrored, pa_mpjpe
-from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import Motion, load_motion, save_motion
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig

@@ -8,7 +8,7 @@ import pytest
 from report_motions import first_frames
 
 from drocap_ros.errors import InputError
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.open_images import open_images
 from drocap_ros.report import motion_images
 from drocap_ros.report.motion_images import ImagesBeside, has_images, read_motion_images

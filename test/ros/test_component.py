@@ -14,8 +14,8 @@ from rclpy.parameter import Parameter
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import ParameterError
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.nodes.initializer import InitializerNode
-from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.diagnostics import Key, values_of

@@ -9,8 +9,8 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import Pose3D
-from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.poses import DEADLINE
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, InMap
 from drocap_ros.ros import conversions as c

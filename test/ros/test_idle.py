@@ -5,7 +5,7 @@ import pytest
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.diagnostics import node_of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS

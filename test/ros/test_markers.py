@@ -4,8 +4,8 @@ from visualization_msgs.msg import ImageMarker, Marker
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import matrix_from_quaternion
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import Pose3D
-from drocap_ros.observation import PoseObservation
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.skeleton import BODY_15

@@ -15,9 +15,9 @@ from visualization_msgs.msg import MarkerArray
 
 from drocap_ros.bringup import free_domain
 from drocap_ros.geometry.rotations import matrix_from_quaternion
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.nodes import visualizer
-from drocap_ros.observation import PoseObservation
 from drocap_ros.ros import markers
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key

@@ -18,8 +18,8 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.vehicle import camera_rotation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import OrbitStatus
-from drocap_ros.observation import PoseObservation
 from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.topics import TOPICS
 from drocap_ros.simulation.keypoint_errors import noisy_keypoints

@@ -51,10 +51,7 @@ def is_motion(message: Message) -> bool:
 def setpoint_message(mav: mavlink.MAVLink, target: tuple[int, int], setpoint: Setpoint) -> Message:
     """Position, velocity, acceleration, yaw and yaw rate in one message.
 
-    Raises
-    ------
-    ValueError
-        When a value is not finite: such a setpoint has crashed an autopilot.
+    Raises ValueError when a value is not finite: such a setpoint has crashed an autopilot.
     """
     if not setpoint.is_finite():
         raise ValueError("expected a setpoint of finite values")

@@ -121,10 +121,7 @@ class MavlinkLink:
 
         A process that was stopped within a control step continues with its setpoint of that time.
 
-        Raises
-        ------
-        AssertionError
-            When motion is not enabled, or the message is not on the list: an error in the program.
+        Raises AssertionError when motion is not enabled, or the message is not on the list: an error in the program.
         """
         self.check_motion(message)
         with self._lock:

@@ -46,7 +46,7 @@ from drocap_ros.flight.orbit.states import (
 )
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.vehicle import VehicleState
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 
 
 class ControlStatus(NamedTuple):

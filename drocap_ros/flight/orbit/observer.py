@@ -21,7 +21,7 @@ from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
 from drocap_ros.flight.vehicle import Doubt, PoseHistory, VehicleFilter, VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.stamps import NS
 
 _CLOCK_JUMP_S = 0.25  # between the clock of the stamps and the monotonic one: a subject's age would be wrong by it

@@ -22,7 +22,7 @@ from drocap_ros.flight.subject.subject_measurement import (
     locate_subject,
 )
 from drocap_ros.flight.vehicle import CameraPose
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.stamps import NS
 
 #: s; older pictures count less.  An orbit of 11 deg/s takes 33 s; the height of the worse autopilot wanders for longer.

@@ -11,7 +11,7 @@ from drocap_ros.flight.bridge_config import SubjectConfig
 from drocap_ros.flight.subject.guard import Parallax
 from drocap_ros.flight.subject.subject_measurement import MAX_BENDING, SubjectMeasurement, locate_subject
 from drocap_ros.flight.vehicle import CameraPose
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.stamps import NS
 
 STANDING_M_S = 0.3  # speed that the estimate of one who stands has

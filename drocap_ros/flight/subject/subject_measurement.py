@@ -18,7 +18,7 @@ import numpy as np
 
 from drocap_ros.flight.bridge_config import SubjectConfig
 from drocap_ros.flight.vehicle import CameraPose
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.skeleton import BODY_15, joint_map
 
 #: Lengths as shares of the stature (Winter, Biomechanics and Motor Control of Human Movement; trunk: hips to the

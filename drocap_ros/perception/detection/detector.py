@@ -157,8 +157,6 @@ class Detector:
     ) -> Detections:
         """Persons in an image.
 
-        Parameters
-        ----------
         image : (H, W, 3) uint8 BGR
         window : x_min, y_min, x_max, y_max px inside the image; None = the whole image
         threshold : least score

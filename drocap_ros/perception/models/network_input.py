@@ -30,8 +30,6 @@ def letterbox(
 ) -> tuple[np.ndarray, Letterbox]:
     """Scale a window of the image into a canvas of ``size`` at its aspect ratio; the rest is grey.
 
-    Parameters
-    ----------
     image : (H, W, 3) uint8
     window : x_min, y_min, x_max, y_max px, inside the image
     size : (width, height) of the canvas

@@ -158,8 +158,6 @@ def open_model(path: Path, threads: int = 1, provider: str = "auto") -> Model:
 class LiteModel(Model):
     """BlazePose as MediaPipe has it, TensorFlow Lite in LiteRT; its outputs are those of this package's layouts.
 
-    Parameters
-    ----------
     path : the ``.tflite`` file
     threads : on the CPU
     """
@@ -214,8 +212,6 @@ def _silent() -> Iterator[None]:
 class OnnxModel(Model):
     """A loaded ONNX model.
 
-    Parameters
-    ----------
     path : the ``.onnx`` file
     threads : intra-op threads on the CPU
     provider : "auto" or a key of the execution providers

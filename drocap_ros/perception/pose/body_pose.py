@@ -51,8 +51,6 @@ _FLOOR_PX = 0.3
 def calibrate(keypoints: NetworkKeypoints, layout: str, sigma_scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Covariance and confidence of one person's keypoints.
 
-    Parameters
-    ----------
     keypoints : P joints
     layout : of the pose model's outputs
     sigma_scale : standard deviations of this model over those of the models of the fit
@@ -95,8 +93,6 @@ class FeetModel:
     def add(self, image: np.ndarray, box: np.ndarray, pose: BodyPose) -> BodyPose:
         """The pose with ``BODY_19``: a foot where both networks see its ankle in one place, else it is not seen.
 
-        Parameters
-        ----------
         image : (H, W, 3) uint8 BGR
         box : (4,) px of the person, where the joints of ``pose`` give none
         """

@@ -60,8 +60,6 @@ def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int], udp: bool = F
     The position is the maximum of the logarithm's Taylor expansion after smoothing (Zhang et al.,
     "Distribution-aware coordinate representation", 2020), exact for a Gaussian peak.
 
-    Parameters
-    ----------
     maps : (P, h, w) float32, larger = more likely
     input_size : (width, height) px of the network's input
     udp : network trained with unit-length coordinates (Huang et al., "The Devil is in the details", 2020): its first
@@ -138,8 +136,6 @@ def _moments(maps: np.ndarray, peak: np.ndarray, xy: np.ndarray) -> np.ndarray:
 def decode_simcc(x: np.ndarray, y: np.ndarray, input_size: tuple[int, int]) -> Peaks:
     """Joints of two stacks of 1-D responses.
 
-    Parameters
-    ----------
     x : (P, width * k) float32; y : (P, height * k) float32, both with peak height about the confidence
     input_size : (width, height) px of the network's input
     """
@@ -206,8 +202,6 @@ class PoseModel:
     def estimate(self, image: np.ndarray, box: np.ndarray) -> NetworkKeypoints:
         """Keypoints of the person in a box.
 
-        Parameters
-        ----------
         image : (H, W, 3) uint8 BGR
         box : (4,) x_min y_min x_max y_max px; may extend beyond the image
         """

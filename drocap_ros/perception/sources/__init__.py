@@ -28,8 +28,6 @@ _CAMERA = re.compile(r"^/dev/video(\d+)$")
 def open_source(uri: str | Path, config: ImageIngestConfig | None = None) -> ImageSource:
     """Source for a video file, an image, a folder of images, ``/dev/videoN``, or a stream's URL.
 
-    Parameters
-    ----------
     uri : path or URL; ``file://`` is allowed
     config : rates, camera mode and time-outs; ``config.source`` is ignored
     """

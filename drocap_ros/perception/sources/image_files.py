@@ -94,8 +94,6 @@ def decoded(data: np.ndarray, form: str) -> np.ndarray:
 def raw_to_bgr(data: np.ndarray, size: tuple[int, int], step: int, encoding: str, big_endian: bool) -> np.ndarray:
     """(H, W, 3) uint8 BGR of the bytes of a raw image.
 
-    Parameters
-    ----------
     data : (N,) uint8
     size : (width, height) px
     step : bytes per row

@@ -86,8 +86,6 @@ class LiveSource(ImageSource):
     stays empty.  A ``STALLED`` event follows ``stall_timeout_s`` without an image.  A connection that ended is opened
     again with doubling pauses, and a ``RECOVERED`` event follows the next image.
 
-    Parameters
-    ----------
     name : in messages
     connect : opens the device, or raises InputError
     config : stall time-out and longest reconnection pause

@@ -52,8 +52,6 @@ _PATCH_PX = (12, 12)  # size of a part, independent of the person's
 def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
     """Colour descriptor of the person in a box.
 
-    Parameters
-    ----------
     image : (H, W, 3) uint8 BGR
     box : (4,) x_min y_min x_max y_max px
 

@@ -208,8 +208,6 @@ def assign_all(
 ) -> tuple[set[int], list[Person]]:
     """Update persons with their detections: first the reliable ones, then the others, then with low scores.
 
-    Parameters
-    ----------
     subject : None while it is lost
     threshold : score below which a detection only continues a reliable track
 
@@ -273,8 +271,6 @@ def assign(
 ) -> list[tuple[int, int]]:
     """Pairs (person, detection) of least total cost within the gates of distance and size.
 
-    Parameters
-    ----------
     persons : predicted to ``stamp_ns``
     low_score : require a high overlap with the prediction, for detections that may be clutter
     subject : the person among them for whom the detector looks in every image

@@ -27,8 +27,6 @@ class CameraMotion:
     def update(self, last: FixedPoints, now: FixedPoints, image_size: tuple[int, int]) -> np.ndarray | None:
         """Motion since the last image, or since an earlier one, as long as it was small.
 
-        Parameters
-        ----------
         last : points of the last image, without those on persons
         now : those of them that this image shows
         image_size : (width, height) px

@@ -71,13 +71,7 @@ class PoseEstimatorConfig(Parameters):
 
 
 def parse_box(text: str) -> np.ndarray:
-    """(4,) x_min y_min x_max y_max from "x,y,x,y".
-
-    Raises
-    ------
-    ParameterError
-        When the text is not such a box.
-    """
+    """(4,) x_min y_min x_max y_max from "x,y,x,y"."""
     try:
         box = np.array([float(v) for v in text.split(",")])
     except ValueError:
@@ -88,13 +82,7 @@ def parse_box(text: str) -> np.ndarray:
 
 
 def parse_subject(text: str) -> tuple[int | None, dict[str, str]]:
-    """A person's number or None, and parameters, of "3", "largest", "centre", a box of :func:`parse_box`, or "".
-
-    Raises
-    ------
-    ParameterError
-        When the text is none of them.
-    """
+    """A person's number or None, and parameters, of "3", "largest", "centre", a box of :func:`parse_box`, or ""."""
     if text.isdecimal():
         return int(text), {}
     if not text or text in ("largest", "centre"):
@@ -110,13 +98,7 @@ _LEAST_BOX_PX = 30
 
 
 def parse_people(text: str) -> tuple[int, ...]:
-    """Numbers of several persons, as "1,3"; empty for every other choice of :func:`parse_subject`.
-
-    Raises
-    ------
-    ParameterError
-        When a number is 0 or comes twice.
-    """
+    """Numbers of several persons, as "1,3"; empty for every other choice of :func:`parse_subject`."""
     words = text.split(",")
     if len(words) < 2 or not all(word.strip().isdecimal() for word in words):
         return ()

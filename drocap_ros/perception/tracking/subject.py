@@ -241,8 +241,6 @@ class SubjectTracker:
     ) -> Subject | None:
         """Update all tracks with one image's detections.
 
-        Parameters
-        ----------
         image : (H, W, 3) uint8 BGR
         stamp_ns : later than the last
         boxes : (N, 4) px; scores : (N,), at least ``low_threshold``

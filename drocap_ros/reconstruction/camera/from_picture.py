@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.camera_path import CameraErrors, CameraPath, Kind, PictureFacts, Teller
-from drocap_ros.geometry.pinhole import centred_camera
+from drocap_ros.geometry.rotations import centred_camera
 from drocap_ros.reconstruction.camera.growth import (
     ENOUGH_PARALLAX,
     LAST_STEPS,

@@ -13,9 +13,8 @@ import numpy as np
 
 from drocap_ros.background import Background
 from drocap_ros.camera_path import CameraErrors, CameraPath, Teller
-from drocap_ros.geometry.ellipsoids import pack_covariance
-from drocap_ros.geometry.position_steps import without_steps
-from drocap_ros.geometry.rotations import exp_so3, hat, log_so3, project_to_so3
+from drocap_ros.geometry.interpolation import without_steps
+from drocap_ros.geometry.rotations import exp_so3, hat, log_so3, pack_covariance, project_to_so3
 from drocap_ros.reconstruction.camera.causes import contradicted_share, single_causes
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path, rough_path
 from drocap_ros.reconstruction.camera.path_model import (

@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.background import Background
 from drocap_ros.camera_path import CameraErrors, CameraPath, UpSource
-from drocap_ros.geometry.ellipsoids import pack_covariance
+from drocap_ros.geometry.rotations import pack_covariance
 from drocap_ros.reconstruction.camera.from_picture import camera_from_points
 from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ
 from drocap_ros.reconstruction.camera.upright import set_upright

@@ -121,8 +121,6 @@ class _Plane(NamedTuple):
 def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
     """The path in metres, z up, the floor at z = 0, and its facts with what tells both.
 
-    Parameters
-    ----------
     camera : with facts of the picture, in any unit and orientation
     seen : (F, 17, 3) m, joints from the camera, in its axes, at the assumed stature
     """

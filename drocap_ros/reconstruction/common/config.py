@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drocap_ros.camera_path import CameraErrors
-from drocap_ros.geometry.pinhole import ASSUMED_FOCAL
+from drocap_ros.geometry.rotations import ASSUMED_FOCAL
 from drocap_ros.parameters import Parameters, param
 
 

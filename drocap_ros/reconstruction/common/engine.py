@@ -195,8 +195,6 @@ _There = TypeVar("_There", bound=_Costed)
 def search_line(cost: float, slope: float, point_at: Callable[[float], _There | None]) -> _There | None:
     """A point whose cost is at most ``cost``: the step's end, or where parabolas through the points put the minimum.
 
-    Parameters
-    ----------
     slope : derivative of the cost along the step at its beginning
     point_at : point at a share of the step; None = not allowed
 

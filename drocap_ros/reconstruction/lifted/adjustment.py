@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from drocap_ros.geometry.bones import pair_lengths
+from drocap_ros.geometry.alignment import pair_lengths
 from drocap_ros.reconstruction.common.engine import (
     Equations,
     add_second_difference,
@@ -225,8 +225,6 @@ def adjust(
 ) -> AdjustmentSolution:
     """Minimise the cost.
 
-    Parameters
-    ----------
     joints : (F, 17, 3) mm, initial; the signs of depth stay as they are
     iterations : most accepted steps
     tolerance : relative decrease of the cost that ends the solve; on MoCap, poses err as with a third of it

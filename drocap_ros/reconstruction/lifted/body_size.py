@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drocap_ros.geometry.bones import bone_lengths
+from drocap_ros.geometry.alignment import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths

@@ -76,8 +76,6 @@ def normalise(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Features of windows of 2D joints.
 
-    Parameters
-    ----------
     keypoints : (..., F, 17, 2), any unit, y down; NaN where not seen
     confidence : (..., F, 17) in [0, 1]
     lengths : (..., 16) of the bones in the unit of the keypoints, NaN where unknown; None = unknown

@@ -109,8 +109,6 @@ def solve_even_window(  # noqa: PLR0913 - what is known of camera, body and dept
 ) -> WindowSolution:
     """Poses of one window of evenly spaced frames.
 
-    Parameters
-    ----------
     keypoints : of ``BODY_17``, any unit, y down; without a covariance the noise is estimated from the sequence
     fps : frames per second
     focal : focal length in the keypoints' unit; None = unknown, the camera is taken as distant

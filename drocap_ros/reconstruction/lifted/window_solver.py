@@ -35,8 +35,6 @@ def depth_signs(
 ) -> np.ndarray:
     """Most plausible signs of depth differences, by dynamic programming over pairs of frames.
 
-    Parameters
-    ----------
     reach : (F, L) >= 0, depth difference of bone l without its sign
     depth, sigma : (F, L) the lifter's depth difference and its expected absolute error
     speed, acceleration : first and second difference of the depth per frame that cost as much as one sigma
@@ -183,8 +181,6 @@ def solve_signs_and_adjust(
 ) -> AdjustmentSolution:
     """Adjusted joints from the 2D joints (F, 17, 2) and the lifter's result, all in mm.
 
-    Parameters
-    ----------
     lengths : (18,) of the adjustment's spans; None = from the 2D joints and the lifter's depths
     evidence : poses of the same frames by another method, any unit
     """

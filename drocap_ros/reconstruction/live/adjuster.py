@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.alignment import limb_lengths
+from drocap_ros.geometry.rotations import unpack_covariance
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
@@ -52,8 +52,6 @@ class LiveAdjuster:
     ) -> AdjustedWindow:
         """Adjust a window.
 
-        Parameters
-        ----------
         effort : limits of the work; None = no limit beyond the configuration
         cancelled : as of :func:`~drocap_ros.reconstruction.lifted.method.solve_even_window`; the result's
             ``effort`` holds the steps taken and repeats the result

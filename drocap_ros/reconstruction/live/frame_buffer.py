@@ -8,8 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import Keypoints2D, PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.window import Window
 from drocap_ros.reconstruction.person_view import assumed_focal_px
@@ -71,8 +70,6 @@ class StreamOrder:
       harm, and a whole stream in 1970 or 2100 works.
     - Another ``track_id`` or image size: the stream restarts.  More than ``gap_s`` later: a gap.
 
-    Parameters
-    ----------
     confirm : False accepts every jump at once, for images that another order has accepted
     """
 

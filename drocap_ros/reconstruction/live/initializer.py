@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.bones import LIMBS_PER_STATURE, bone_lengths, limb_lengths
-from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.geometry.alignment import LIMBS_PER_STATURE, bone_lengths, limb_lengths
+from drocap_ros.keypoints import Keypoints2D, PoseObservation
 from drocap_ros.leg_sides import with_own_legs
-from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.common.windows import even_slots
 from drocap_ros.reconstruction.lifted.lifter import Lifter

@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.camera_path import CameraPath
-from drocap_ros.geometry.bones import bone_lengths
-from drocap_ros.geometry.ellipsoids import unpack_covariance
-from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.geometry.alignment import bone_lengths
+from drocap_ros.geometry.rotations import exp_so3, unpack_covariance
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.reconstruction.world.world_model import MEASURED
@@ -85,8 +84,6 @@ class LatestPlace:
     ) -> PlacedPose | None:
         """The image's pose in ``map``; None without a solution there, the camera's pose or enough keypoints.
 
-        Parameters
-        ----------
         pose : joints (P, 3) m and covariance (P, 6) m^2 in camera axes, pelvis at the origin
         keypoints : (P, 2) px, NaN where not seen
         camera : as reported at this image alone

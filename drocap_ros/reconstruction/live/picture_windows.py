@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.camera_path import CameraPath
-from drocap_ros.geometry.ellipsoids import pack_covariance, unpack_covariance
-from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.geometry.rotations import exp_so3, pack_covariance, unpack_covariance
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.camera.growth import LEAST_POINTS
 from drocap_ros.reconstruction.camera.path_model import LEAST_VIEWS

@@ -14,7 +14,7 @@ import numpy as np
 from drocap_ros.background import Background
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.errors import InputError
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer
@@ -52,8 +52,6 @@ def live_poses(
 ) -> Iterator[LivePose | LiveWindow]:
     """Poses and windows in the order of the live graph; memory is that of one window.
 
-    Parameters
-    ----------
     observations : in the order of their messages; those that the nodes drop are skipped
     effort_at : gives by the stamp of a window's newest image the effort of the live graph, None where it skipped the
         window (one is skipped while another is running); without it all windows that are due, with full effort

@@ -10,7 +10,7 @@ import numpy as np
 
 from drocap_ros.background import Background
 from drocap_ros.camera_path import CameraPath
-from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
+from drocap_ros.geometry.alignment import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.keypoints import Keypoints2D
 
 #: Share of the allowed time above which the next window gets coarser: a tenth is left for its spread.
@@ -79,8 +79,6 @@ class Effort:
 class EffortControl:
     """Chooses the stride of the next window from the duration of the last adjustment.
 
-    Parameters
-    ----------
     allowed_s : for one adjustment
     max_stride : the coarsest
     """

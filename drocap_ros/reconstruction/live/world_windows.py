@@ -237,8 +237,6 @@ class WorldWindows:
     def adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
         """The window's result in ``map``, or that in the camera's axes with the use of the telemetry.
 
-        Parameters
-        ----------
         w : its keypoints are NaN where not seen
         found : the window's poses in px
         camera_result : its result in camera axes

@@ -180,8 +180,6 @@ def bundle_adjust(
 ) -> AdjustmentResult:
     """Refine poses over one window of frames.
 
-    Parameters
-    ----------
     w : (F, P, 2) 2D joints of BODY_15, centred about the person, in units of their standard deviation
     information : (F, P, 3) of :func:`~drocap_ros.reconstruction.paper.reprojection.information_from`, 0 where not seen
     s0 : (F, P, 3) initial poses in camera axes (x right, y down, z forward), in the unit of w
@@ -222,8 +220,6 @@ class Outcome(NamedTuple):
 def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, Outcome]:
     """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise.
 
-    Parameters
-    ----------
     s : (3, P, F) initial shapes
 
     Returns

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.alignment import to_torso_frame
-from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
+from drocap_ros.geometry.alignment import LIMBS_PER_STATURE, limb_lengths, to_torso_frame
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import read_npz
 
@@ -58,8 +57,6 @@ class Dictionary:
 def normalize_poses(x: np.ndarray) -> np.ndarray:
     """MoCap poses in the dictionary's frame and scale.
 
-    Parameters
-    ----------
     x : (N, 15, 3) joints of BODY_15, any right-handed frame and unit
 
     Returns

@@ -38,8 +38,6 @@ def factorize(
 ) -> tuple[np.ndarray, dict[str, float], int, str]:
     """Poses of one window by MF+NNM.
 
-    Parameters
-    ----------
     w, information : (F, P, 2) and (F, P, 3), normalized; missing joints are interpolated for the factorization
 
     Returns

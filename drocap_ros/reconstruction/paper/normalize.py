@@ -41,8 +41,6 @@ class NormalizedTracks:
 def normalize_tracks(keypoints: Keypoints2D) -> NormalizedTracks:
     """Centre each image's seen joints and scale the sequence to unit standard deviation.
 
-    Parameters
-    ----------
     keypoints : px; confidences of NaN and 0 count as not seen; covariances of seen joints must be positive definite
     """
     weights = keypoints.seen.astype(np.float64)

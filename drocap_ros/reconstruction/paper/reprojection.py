@@ -14,8 +14,6 @@ _LARGEST_GAIN = 4.0
 def information_from(w: np.ndarray, weights: np.ndarray | None, covariance: np.ndarray | None) -> np.ndarray:
     """(F, P, 3) information xx, xy, yy per joint; 1, 0, 1 is an ordinary joint, 0 a missing one.
 
-    Parameters
-    ----------
     w : (F, P, 2), NaN where not seen
     weights : (F, P) >= 0, or None
     covariance : (F, P, 3) xx, xy, yy in units of w squared; the median variance counts as ordinary

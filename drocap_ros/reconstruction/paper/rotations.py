@@ -16,8 +16,6 @@ def update_rotations(
 ) -> np.ndarray:
     """Rotations (3, 3, F) of lower or equal cost.
 
-    Parameters
-    ----------
     s : (3, P, F) shapes, fixed
     r : (3, 3, F) present rotations
     smoothness : weight of the squared chordal distances of neighbouring rotations

@@ -40,8 +40,6 @@ def initialize(
 ) -> SingleViewFit:
     """Poses of all frames: viewpoint search, choice over time, sparse refinement within EM over the 2D joints.
 
-    Parameters
-    ----------
     w : (F, P, 2) centred joints in units of their standard deviation, 0 where the information is 0
     information : (F, P, 3) of :func:`~drocap_ros.reconstruction.paper.reprojection.information_from`
     """
@@ -80,8 +78,6 @@ def sparse_from_dense(coefficients: np.ndarray, dictionary: Dictionary) -> np.nd
 def choose_path(cost: np.ndarray, poses: np.ndarray, switch_cost: float) -> np.ndarray:
     """Hypothesis (F,) int of each frame with the least total cost over the sequence (Viterbi 1967).
 
-    Parameters
-    ----------
     cost : (H, F) of each hypothesis alone
     poses : (H, F, P, 3) camera axes
     switch_cost : weight of the squared distance between the poses of neighbouring frames
@@ -110,8 +106,6 @@ def expected_information(
 
     The E-step of Zhou et al. 2016, section 4: one Gaussian per joint and a share of gross outliers.
 
-    Parameters
-    ----------
     w, information : (F, P, 2), (F, P, 3), 0 where not seen
     projected : (F, P, 2) the model's joints in the image
     std : standard deviation of an ordinary joint about the model

@@ -41,8 +41,6 @@ def fit_sparse(
 ) -> SparseFit:
     """Refine initial poses over one block of frames.
 
-    Parameters
-    ----------
     rotation, coefficients : (F, 3, 3), (F, 1 + K) initial values
     """
     basis = dictionary.basis
@@ -144,8 +142,6 @@ def search_viewpoints(
 ) -> DenseFit:
     """Fits from every initial viewpoint, with a leading axis of viewpoints: (A, F, ...).
 
-    Parameters
-    ----------
     w, information : (F, P, 2), (F, P, 3)
     """
     views = initial_viewpoints(w, information, config.search_azimuths, np.deg2rad(config.search_elevation_deg))

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.ellipsoids import pack_covariance, unpack_covariance
+from drocap_ros.geometry.rotations import pack_covariance, unpack_covariance
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.common.engine import blas_threads
 from drocap_ros.reconstruction.in_metres import reprojection_px

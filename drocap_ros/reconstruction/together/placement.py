@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3, project_to_so3
 from drocap_ros.reconstruction.together.view import View
 
@@ -50,8 +50,6 @@ class Placement(NamedTuple):
 def place_view(first: View, second: View, offset_s: float, upright: bool) -> Placement:
     """Where the second view's world lies in the first's.
 
-    Parameters
-    ----------
     offset_s : time of the first less that of the second
     upright : both worlds know up, so they differ by a turn about it
     """

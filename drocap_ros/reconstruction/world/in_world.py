@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.camera_path import CameraPath
-from drocap_ros.geometry.position_steps import without_steps
+from drocap_ros.geometry.interpolation import without_steps
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -46,8 +46,6 @@ def in_world(
 ) -> WorldResult:
     """Poses placed by the camera's rotation and, with its position and matrix, adjusted with it.
 
-    Parameters
-    ----------
     keypoints : of the method's joints
     per_px : (F,) metres per px at the assumed stature
     config : of the adjustment; None = the poses are placed alone

@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.contacts import rest_likelihood
-from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
+from drocap_ros.geometry.alignment import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.reconstruction.world.world_model import MEASURED
 from drocap_ros.skeleton import BODY_15
 
@@ -44,8 +44,6 @@ class ScaleEstimate:
 def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.ndarray) -> ScaleEstimate | None:
     """Scale at which the feet are still.
 
-    Parameters
-    ----------
     feet : (F, N, 3) m at the assumed scale, camera to foot, world axes
     camera_position : (F, 3) m, world axes
     stamp_ns : (F,)

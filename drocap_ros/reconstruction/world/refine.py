@@ -10,8 +10,7 @@ import numpy as np
 
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.contacts import ANKLES
-from drocap_ros.geometry.ellipsoids import pack_covariance
-from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.geometry.rotations import exp_so3, pack_covariance
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths

@@ -160,8 +160,6 @@ def _stages(config: WorldConfig, held: int) -> Iterator[_Stage]:
 def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> WorldSolution:
     """Adjust from a point.
 
-    Parameters
-    ----------
     start : its lengths and floor do not matter
     held : so many frames at the begin keep their joints and their camera's errors
     """

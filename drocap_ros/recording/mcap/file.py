@@ -21,16 +21,11 @@ class McapFile:
     topics : by name, with the number of their messages in this file
     record : the file's entry in ``metadata.yaml``
 
-    Parameters
-    ----------
     path : to create
     compression : "none", "lz4" or "zstd"
     chunk_bytes : a chunk that has grown to this size is closed
 
-    Raises
-    ------
-    OSError
-        When the file exists or cannot be written.
+    Raises OSError when the file exists or cannot be written.
     """
 
     def __init__(
@@ -194,10 +189,7 @@ class CommittedFile:
     def commit(self, sync: bool = False) -> None:
         """Write the collected bytes; ``sync`` forces them to the disk.
 
-        Raises
-        ------
-        OSError
-            When they cannot be written; the file then ends at the last commit.
+        Raises OSError when they cannot be written; the file then ends at the last commit.
         """
         view = memoryview(bytes(self._pending))
         self._pending.clear()

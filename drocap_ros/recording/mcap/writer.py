@@ -121,8 +121,6 @@ class SessionWriter:
 
     error : reason of an early end of the recording, one line; None without one
 
-    Parameters
-    ----------
     folder : to create; it must not exist, or be empty
     config : chunks, files, queue, free space
     metadata : configuration, versions, model hashes and the like
@@ -192,8 +190,6 @@ class SessionWriter:
     def register(self, topic: str, type_name: str, schema: str, *, image: bool = False) -> None:
         """Declare a topic before its first message; a repeated call has no effect.
 
-        Parameters
-        ----------
         type_name : ``package/msg/Name``
         schema : its definition with all dependencies, see :func:`drocap_ros.recording.mcap.metadata.schema_text`
         image : whether its messages may be dropped before others

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.vehicle import camera_rotation, quaternion_from_euler
-from drocap_ros.geometry.interpolation import interpolate, true_runs
-from drocap_ros.geometry.position_steps import without_steps
+from drocap_ros.geometry.interpolation import interpolate, true_runs, without_steps
 from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import VehicleTrack
 from drocap_ros.tracks import Tracks
@@ -72,8 +71,6 @@ def with_camera(
 ) -> tuple[Tracks, str]:
     """Tracks with the camera's pose at each image, and as text what is missing; see :func:`camera_poses`.
 
-    Parameters
-    ----------
     at_ns : (F,) times of the images by the clock of the vehicle's states
     """
     poses = camera_poses(vehicle, at_ns, mount_pitch_deg)

@@ -67,12 +67,7 @@ def has_djmd(path: Path) -> bool:
 def read_djmd(path: Path) -> TelemetryLog:
     """Gimbal and aircraft attitude, position and lens of every image, by the video's own clock.
 
-    Raises
-    ------
-    InputError
-        When there is no such track, or its content is damaged or cannot be true.
-    OSError
-        When the file cannot be read.
+    Raises OSError when the file cannot be read.
     """
     found = find_track(path, (_FORMAT, *TEXT_TRACKS))
     if found is None:

@@ -26,10 +26,7 @@ _SIZES = {1: 8, 5: 4}
 def read_message(data: bytes) -> dict[int, Value]:
     """Fields of a message by number; of a repeated one the last.  Integers are signed by two's complement.
 
-    Raises
-    ------
-    ValueError
-        When the data is no message.
+    Raises ValueError when the data is no message.
     """
     fields: dict[int, Value] = {}
     place, end = 0, len(data)

@@ -10,7 +10,7 @@ from drocap_ros.flight.bridge_config import SubjectConfig
 from drocap_ros.flight.orbit.speed import limit_closing
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.vehicle import CameraPose
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person

@@ -9,7 +9,7 @@ from drocap_ros.flight.bridge_config import OrbitConfig, SubjectConfig
 from drocap_ros.flight.orbit.planner import least_radius
 from drocap_ros.flight.subject.subject_filter import SubjectFilter
 from drocap_ros.flight.vehicle import CameraPose
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 

@@ -9,7 +9,7 @@ from drocap_ros.flight.orbit.states import Action
 from drocap_ros.flight.subject import subject_filter
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
-FAULT_S, SECONDS = 12.0, 32.0
+FAULT_S, SECONDS = 12.0, 26.0
 RANGE_ERROR = 1.4
 LATE_NS = 100_000_000
 #: The bridge knows the estimated distance: where it is too long by 40 %, the limit of 3 m is 2.14 m in truth.  Stamps
@@ -38,8 +38,7 @@ def swinging_range(loop, period_s):
 @pytest.mark.parametrize(
     ("autopilot", "radius_m", "period_s"),
     [
-        ("ardupilot", 6.0, 9.0), ("ardupilot", 4.2, 5.0), ("ardupilot", 9.0, 7.0),
-        ("px4", 6.0, 9.0), ("px4", 5.0, 5.0), ("px4", 9.0, 7.0),
+        ("ardupilot", 6.0, 9.0), ("ardupilot", 4.2, 5.0), ("px4", 5.0, 5.0), ("px4", 9.0, 7.0),
     ],
 )  # fmt: skip
 def test_receding_estimate_of_a_standing_person(autopilot, radius_m, period_s, monkeypatch):

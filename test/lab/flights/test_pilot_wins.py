@@ -11,7 +11,7 @@ from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 
 MODES = {"ardupilot": ("LOITER", "RTL", "LAND"), "px4": ("RTL", "LOITER", "POSCTL")}
 FAULTS = ("lost", "late", "lossy", "shuffled")
-MOMENTS, FLOWN = 4, 13  # orbits and ends of each autopilot; ``benchmarks/flight_kills.py pilot`` flies 200
+MOMENTS, FLOWN = 2, 5  # orbits and ends of each autopilot; ``benchmarks/flight_kills.py pilot`` flies 200
 WATCHED_S, RETURNED_S = 5.0, 2.5
 
 

@@ -7,7 +7,7 @@ import pytest
 from tiny_models import write_model
 
 from drocap_ros.errors import InputError
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.load_models import load_feet_model
 from drocap_ros.perception.models.network_input import crop_around
 from drocap_ros.perception.pose.body_pose import BodyPose

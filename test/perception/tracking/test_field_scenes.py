@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from field_scenes import FieldImage, FieldScene, field_images, on_subject
 
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.estimator import PoseEstimator

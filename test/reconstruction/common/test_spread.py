@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.geometry.ellipsoids import unpack_covariance
-from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.geometry.rotations import exp_so3, unpack_covariance
 from drocap_ros.reconstruction.common.poses import Spread, packed
 
 

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.geometry.bones import bone_lengths
+from drocap_ros.geometry.alignment import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted.method import solve_even_window
 from drocap_ros.reconstruction.reconstruct import reconstruct

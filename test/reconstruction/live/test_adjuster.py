@@ -12,9 +12,8 @@ from walking import make_walk, stamps
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.geometry.ellipsoids import unpack_covariance
-from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.geometry.alignment import limb_lengths
+from drocap_ros.geometry.rotations import exp_so3, unpack_covariance
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.adjuster import LiveAdjuster

@@ -11,8 +11,8 @@ from walking import Walk, make_walk
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import is_mirrored, pa_mpjpe
-from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.observation import PoseObservation
+from drocap_ros.geometry.alignment import limb_lengths
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.live.frame_buffer import StreamEvent
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer

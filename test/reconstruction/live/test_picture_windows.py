@@ -15,7 +15,7 @@ from drocap_ros.background import Background
 from drocap_ros.evaluation.compare import world_errors
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.camera_history import CameraHistory
-from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.rotations import unpack_covariance
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.replay import LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import Effort, TelemetryUse
@@ -77,7 +77,7 @@ def test_windows_are_in_a_world_of_the_picture_with_its_up_and_metres() -> None:
         assert "path 1" in after.window.picture
 
 
-@pytest.mark.parametrize("stride", [2, 3, 4])
+@pytest.mark.parametrize("stride", [2, 4])
 @pytest.mark.parametrize("speed_deg_s", [25.0, 0.0])
 def test_a_path_goes_on_in_windows_that_share_no_image(speed_deg_s: float, stride: int) -> None:
     true = orbit(7.0, speed_deg_s=speed_deg_s)

@@ -11,7 +11,7 @@ from live_stream import observed
 from walking import make_walk, stamps
 
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 

@@ -17,7 +17,7 @@ from drocap_ros.camera_path import CameraPath
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.rotations import exp_so3, log_so3, quaternion_from_matrix
-from drocap_ros.observation import PoseObservation
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.camera.fusion import Fusion, fuse_telemetry
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -151,9 +151,9 @@ def test_a_window_continues_the_one_before_without_a_step() -> None:
 
 def test_findings_are_carried_from_window_to_window() -> None:
     """After the orbit the camera stands still: no window of its own measures the scale any more."""
-    still = orbit(21.0, action="stand")
+    still = orbit(16.0, action="stand")
     joints = still.truth
-    stop = round(10.0 * FPS)
+    stop = round(8.0 * FPS)
     at = np.minimum(np.arange(len(joints)), stop)
     sway = 0.002 * np.sin(np.arange(len(joints)))[:, None]
     hover = replace(still, rotation=still.rotation[at], position=still.position[at] + sway)

@@ -8,7 +8,7 @@ from walking import Walk, make_walk
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.paper.bundle_adjustment import AdjustmentResult, bundle_adjust

@@ -11,7 +11,7 @@ from walking import make_walk
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.truth_files import load_mocap
-from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.reconstruction.paper.dictionary import (
     Dictionary,
     load_dictionary,

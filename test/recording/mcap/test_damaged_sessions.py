@@ -66,7 +66,7 @@ def _attempt(path):
     assert "\n" not in text
 
 
-@settings(max_examples=120, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_mutated_files_give_a_result_or_one_clear_line(tmp_path, whole, seed):
     rng = random.Random(seed)
@@ -91,7 +91,7 @@ def test_mutated_files_give_a_result_or_one_clear_line(tmp_path, whole, seed):
 def test_wrong_lengths_take_no_memory(tmp_path, whole):
     tracemalloc.start()
     rng = random.Random(3)
-    for i in range(60):
+    for i in range(40):
         data = bytearray(whole)
         place = rng.randrange(8, 600) if i % 2 else rng.randrange(8, len(data) - 8)
         data[place : place + 8] = (2 ** rng.choice([30, 33, 40, 62])).to_bytes(8, "little")
@@ -103,7 +103,7 @@ def test_wrong_lengths_take_no_memory(tmp_path, whole):
     assert peak < 200e6
 
 
-@settings(max_examples=60, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(text=st.text(max_size=300) | st.binary(max_size=300).map(lambda b: b.decode("latin-1")))
 def test_any_metadata_file_gives_a_result_or_one_clear_line(tmp_path, whole, text):
     folder = tmp_path / "folder"

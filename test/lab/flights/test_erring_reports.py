@@ -9,7 +9,7 @@ from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_
 from lab.studies.report_errors import LEFT_OUT, recorded_errors, simulated_errors
 
 
-def flown(autopilot, seed, seconds=62.0, **values):
+def flown(autopilot, seed, seconds=38.0, **values):
     """An orbit of 6 m at 19 deg/s, and where the subject was believed, less the error of the estimate."""
     settings = LoopSettings(autopilot=autopilot, seed=seed, seconds=seconds + 1.0, **values)
     loop = OrbitLoop(with_config(settings, radius_m=6.0, angular_speed_deg_s=19.0))
