@@ -18,9 +18,6 @@ from pathlib import Path
 
 from drocap_ros.errors import DrocapError, InputError
 
-#: What to do where no LiteRT is.
-MISSING_LITERT = "expected the package ai-edge-litert, which runs it, found none; run pip install ai-edge-litert"
-
 #: Seconds of one package, of at most 36 MB, on a line of 2 Mbit/s.
 _PIP_TIMEOUT_S = 180
 
@@ -209,6 +206,8 @@ def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) 
     """
     target = folder / model.file
     if model.package and find_spec("ai_edge_litert") is None:
+        from drocap_ros.perception.models.runtime import MISSING_LITERT
+
         raise InputError(f"{model.name}: {MISSING_LITERT}")
     if target.is_file() and sha256_of(target) == model.sha256:
         return target

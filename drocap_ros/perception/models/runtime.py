@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.perception.models.fetch import MISSING_LITERT
 
 #: Side of the detector's input, px, and the strides of its anchors: two anchors a cell for each entry.
 _SIDE = 224
@@ -190,6 +189,10 @@ class LiteModel(Model):
         self._network.set_tensor(self._input, np.ascontiguousarray(tensor, np.float32))
         self._network.invoke()
         return as_layout([self._network.get_tensor(index) for index in self._outputs])
+
+
+#: What to do where no LiteRT is.
+MISSING_LITERT = "expected the package ai-edge-litert, which runs it, found none; run pip install ai-edge-litert"
 
 
 @contextlib.contextmanager
