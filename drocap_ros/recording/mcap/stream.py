@@ -47,6 +47,7 @@ class DamageKind(Enum):
     SKIPPED_BYTES = "{amount} bytes skipped at byte {offset}"
     DAMAGED_CHUNKS = "{amount} damaged chunks"
     UNKNOWN_CHANNELS = "{amount} messages of unknown channels"
+    DECLARATIONS = "{amount} topics or types that are declared in two ways"
     NO_SUMMARY = "no summary at the end"
     NO_MESSAGE = "no message in it"
 
@@ -163,8 +164,11 @@ class McapStream:
         last = [] if summary is None else [*summary.schemas.values(), *summary.channels.values()]
         for record in chain(McapStream(self.path, resync=True)._records(), last):
             if isinstance(record, Schema | Channel):
-                said[type(record), record.id][text := repr(record)] += 1
+                values = {name: sorted(v.items()) if isinstance(v, dict) else v for name, v in vars(record).items()}
+                said[type(record), record.id][text := repr(values)] += 1
                 records[text] = record
+        if differ := sum(len(texts) > 1 for texts in said.values()):
+            self.damage.append(Damage(DamageKind.DECLARATIONS, amount=differ))
         most = {of: records[texts.most_common(1)[0][0]] for of, texts in said.items()}
         return {
             record.id: _channel(record, most.get((Schema, record.schema_id)))  # type: ignore[arg-type]
