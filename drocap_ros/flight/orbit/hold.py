@@ -46,7 +46,7 @@ _HARMLESS = PICTURE_CODES | {ConditionCode.ATTITUDE_OUTDATED, ConditionCode.POSI
 
 
 def begin_hold(
-    state: Orbiting | Holding,
+    state: Orbiting | Holding | Requesting,
     reason: Condition,
     seen: Observed,
     now_s: float,
@@ -68,19 +68,19 @@ def begin_hold(
     age_s = max(vehicle.position_age_s, vehicle.age_s)
     known = located(seen) and age_s <= _DEAD_RECKONING_S
     fresh = known and max(seen.link.age_s, age_s) <= UNSEEN_S
-    place = None
+    place, fence = None, None if isinstance(state, Requesting) else state.fence_centre
     if known:
         if isinstance(state, Orbiting) and state.pace.value == 0.0 and reason.code in _HARMLESS:
             place = state.pace.place  # it stands there
         else:
-            place = _stopping_place(seen, fresh, state.fence_centre, fence_radius_m)
+            place = _stopping_place(seen, fresh, fence, fence_radius_m)
     return Holding(
         now_s,
         reason,
         modes=state.modes,
         position=place,
         yaw=vehicle.yaw,
-        fence_centre=state.fence_centre,
+        fence_centre=fence,
         blind=blind and not fresh,
         retreats=retreats,
         hold_mode_s=None if seen.course.followed else now_s,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -82,7 +83,7 @@ def reduce(
     elif isinstance(state, Requesting):
         state = _request(state, seen, now_s, problem, limits)
     elif isinstance(state, Idle):
-        state = _wait(state, now_s, problem)
+        state = _wait(state, seen, now_s, problem, limits)
     elif isinstance(state, Holding) and not stream_ended(seen):
         state = update_hold(state, seen, now_s, vehicle is not None)
         state = _hold(state, seen, now_s, problem, limits, astray=bool(vehicle or place))
@@ -188,7 +189,7 @@ def permit_mode(state: SafetyState, mode: str) -> SafetyState:
 def _execute(
     state: SafetyState, seen: Observed, now_s: float, command: Command, problem: Condition | None, limits: Limits
 ) -> tuple[SafetyState, CommandAnswer]:
-    state = dataclasses.replace(state, failed=None) if isinstance(state, Idle) else state
+    state = dataclasses.replace(state, failed=None, asked_s=-math.inf) if isinstance(state, Idle) else state
     if command == Command.STOP:
         return _stop(state, seen, now_s, limits)
     if command == Command.ADJUST:
@@ -243,8 +244,9 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
         blind = vehicle_condition(seen, limits) is not None
         return begin_hold(state, answer.condition, seen, now_s, limits.safety.fence_radius_m, blind=blind), answer
     if isinstance(state, TakenOver | Fault | Requesting):
-        answer = _accepted(_C.STOPPED if isinstance(state, Requesting) else _C.ACKNOWLEDGED)
-        return Idle(now_s, answer.condition), answer
+        requested = isinstance(state, Requesting)
+        answer = _accepted(_C.STOPPED if requested else _C.ACKNOWLEDGED)
+        return Idle(now_s, answer.condition, asked_s=now_s if requested else -math.inf), answer
     if isinstance(state, Holding):
         return dataclasses.replace(state, resumable=False), _accepted(_C.ALREADY_HOLDING)
     return state, _accepted(_C.NOT_ORBITING)
@@ -265,16 +267,22 @@ def _request(state: Requesting, seen: Observed, now_s: float, problem: Condition
             return state
         cause = problem if seen.mode.in_control else None  # with the mode granted, it has delayed the orbit so long
     failed = condition(_C.REQUEST_ENDED, cause=cause) if cause else _not_granted(seen)
-    return (Idle if problem else Ready)(now_s, failed, failed=failed)
+    ended = (Idle if problem else Ready)(now_s, failed, failed=failed, asked_s=now_s)
+    return _wait(ended, seen, now_s, problem, limits)
 
 
-def _wait(state: Idle, now_s: float, problem: Condition | None) -> SafetyState:
-    """Idle and ready."""
+def _wait(state: Idle, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
+    """Idle and ready; control that is granted when nobody asks for it any more is held, and handed on."""
+    if seen.mode.in_control and now_s - state.asked_s <= limits.safety.engage_timeout_s:
+        blind = vehicle_condition(seen, limits) is not None
+        granted = Requesting(now_s, modes=frozenset({seen.mode.name}))
+        reason = state.failed or state.condition
+        return begin_hold(granted, reason, seen, now_s, limits.safety.fence_radius_m, blind=blind)
     reason = problem or state.failed or condition(_C.ALL_CLEAR)
     wanted = Idle if problem else Ready
     if (type(state), state.condition) == (wanted, reason):
         return state
-    return wanted(now_s, reason, failed=state.failed)
+    return wanted(now_s, reason, failed=state.failed, asked_s=state.asked_s)
 
 
 def _not_granted(seen: Observed) -> Condition:

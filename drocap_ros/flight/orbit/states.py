@@ -126,10 +126,12 @@ class Idle(SafetyState):
     """Something forbids motion.
 
     failed : why the last request of control ended without an orbit, until the next command; None = it did not
+    asked_s : when a request of control ended that the autopilot may still grant; -infinity = there is none
     """
 
     state = State.IDLE
     failed: Condition | None = None
+    asked_s: float = -math.inf
 
 
 @dataclass(frozen=True)

@@ -304,6 +304,25 @@ def test_a_pending_engage_holds_the_vehicle_where_it_is_while_the_pilot_flies_on
     assert reduce(state, nearer, now_s + 0.05, None, LIMITS)[1].action == Action.NOTHING
 
 
+@pytest.mark.parametrize("end", ["stop", "time-out", "gps"])
+@pytest.mark.parametrize("later_s", [0.05, 1.0, 3.0, 4.9])
+def test_control_that_is_granted_when_nobody_asks_for_it_any_more_is_held_where_the_vehicle_is(end, later_s):
+    state, _ = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    state, _ = reduce(state, LOITER, 0.5, None, LIMITS)
+    ended_s = 20.0 if end == "time-out" else 1.0
+    seen, command = (bad("gps", LOITER), None) if end == "gps" else (LOITER, Command.STOP if end == "stop" else None)
+    state, decision = reduce(state, seen, ended_s, command, LIMITS)
+    assert decision.action == Action.NOTHING
+    place = GOOD.vehicle.position + np.array([0.7, -0.4, 0.2])
+    state, decision = reduce(state, changed(GOOD, position=place), ended_s + later_s, None, LIMITS)
+    assert (state.state, decision.action) == (State.HOLDING, Action.HOLD)
+    assert np.linalg.norm(state.position - place) < 0.5  # where it can stop
+    # A pilot who enters the control mode long after is not held.
+    state, _ = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    state, _ = reduce(state, LOITER, 0.5, Command.STOP, LIMITS)
+    assert reduce(state, GOOD, 7.0, None, LIMITS)[1].action == Action.NOTHING
+
+
 def test_disarming_ends_the_orbit_and_disabled_commands_are_refused():
     state, decision = reduce(orbiting(), changed(GOOD, armed=False), 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.IDLE, Action.NOTHING)

@@ -229,7 +229,9 @@ def test_gap_of_data_while_control_is_requested_delays_the_orbit(name):
     state, decision = reduce(permit_mode(state, "GUIDED"), seen(**gap[name]), 5.1, None, LIMITS)
     assert (state.state, decision.action) == (State.READY, Action.HOLD)
     assert reduce(state, GOOD, 5.2, None, LIMITS)[0].state == State.ORBITING
-    assert reduce(state, seen(**OLD[name]), 5.2, None, LIMITS)[0].state == State.IDLE
+    # Control is granted: what ends the request ends in a hold, not in silence.
+    ended, decision = reduce(state, seen(**OLD[name]), 5.2, None, LIMITS)
+    assert (ended.state, decision.action) == (State.HOLDING, Action.HOLD)
 
 
 @pytest.mark.parametrize("command", [Command.START, Command.ENGAGE])
