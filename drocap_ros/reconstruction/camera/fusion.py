@@ -19,7 +19,6 @@ from drocap_ros.reconstruction.camera.causes import contradicted_share, single_c
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path, rough_path
 from drocap_ros.reconstruction.camera.path_model import (
     ATTITUDE_LATENCY,
-    KNOT,
     KNOTS_HZ,
     MISALIGNMENT,
     POSITION_LATENCY,
@@ -29,7 +28,7 @@ from drocap_ros.reconstruction.camera.path_model import (
     views_of,
 )
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
-from drocap_ros.reconstruction.common.windows import even_slots, fade_weights, windows
+from drocap_ros.reconstruction.common.windows import Faded, even_slots, fade_weights, windows
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry, at_other_time
 from drocap_ros.reconstruction.world.even_capture import at_all_slots, capture_parts
 from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
@@ -91,7 +90,7 @@ def fuse_telemetry(
     origin = position.mean(axis=0)
     path = at_all_slots(without_steps(position, camera.stamp_ns) - origin, slot)
     turn = project_to_so3(at_all_slots(rotation, slot))
-    faded = _Faded(len(turn))
+    faded = Faded(len(turn))
     best: tuple[AdjustedPath, CameraTelemetry] | None = None
     for part in capture_parts(camera.stamp_ns, slot):
         # Points that contradict a part of a path lose their weight there: it would stay as reported.
@@ -103,11 +102,12 @@ def fuse_telemetry(
             found = _of_window(given, (slot, rows.start), camera, points, known)
             if isinstance(found, Refusal) or found is None:
                 return found
-            faded.add(rows, fade_weights(inside, part.stop - part.start, _OVERLAP), given, found)
+            faded.add(rows, fade_weights(inside, part.stop - part.start, _OVERLAP), **_correction(given, found))
             if best is None or given.frames > best[1].frames:
                 best = found, given
     assert best is not None  # a recording has a part, and it has a window
-    change, covariance, steps = faded.mean()
+    change, covariance, steps = faded.mean().values()
+    steps = steps[faded.weight > 0.0].mean(axis=0)
     wander = _wander(best[0].state, best[1], _errors(camera))
     corrected = replace(
         camera,
@@ -240,35 +240,21 @@ def _wander(found: PathState, given: CameraTelemetry, expected: CameraErrors) ->
     return float(np.sqrt(change[:3].mean())), float(np.degrees(np.sqrt(change[3:].mean())))
 
 
-class _Faded:
-    """Corrections of windows, faded into each other, their covariances, and those of the motion within a second."""
-
-    def __init__(self, slots: int) -> None:
-        self._sums = [np.zeros((slots, *shape)) for shape in ((KNOT,), (KNOT, KNOT), (KNOT,))]
-        self._weight = np.zeros(slots)
-
-    def add(self, rows: slice, fade: np.ndarray, given: CameraTelemetry, found: AdjustedPath) -> None:
-        assert found.posterior is not None
-        turned = log_so3(found.rotation @ np.swapaxes(given.rotation, 1, 2))
-        moved = found.position - given.position
-        knots = np.linspace(0, len(found.posterior.pose) - 1, given.frames)
-        near = np.round(knots).astype(np.intp)
-        # Steps between knots add up to a second as independent ones do.
-        hz = (len(found.posterior.pose) - 1) * given.fps / max(given.frames - 1, 1)
-        steps = hz * np.diagonal(found.posterior.steps, axis1=1, axis2=2)
-        values = (
-            np.concatenate([moved, turned], axis=1),
-            found.posterior.pose[near],
-            steps[np.minimum(near, len(steps) - 1)],
-        )
-        for total, value in zip(self._sums, values, strict=True):
-            total[rows] += fade.reshape(-1, *(1,) * (value.ndim - 1)) * value
-        self._weight[rows] += fade
-
-    def mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        weight = np.where(self._weight == 0.0, 1.0, self._weight)
-        change, covariance, steps = (total / weight.reshape(-1, *(1,) * (total.ndim - 1)) for total in self._sums)
-        return change, covariance, steps[self._weight > 0.0].mean(axis=0)
+def _correction(given: CameraTelemetry, found: AdjustedPath) -> dict[str, np.ndarray]:
+    """What a window corrects, its covariance, and that of the motion within a second, of every frame."""
+    assert found.posterior is not None
+    turned = log_so3(found.rotation @ np.swapaxes(given.rotation, 1, 2))
+    moved = found.position - given.position
+    knots = np.linspace(0, len(found.posterior.pose) - 1, given.frames)
+    near = np.round(knots).astype(np.intp)
+    # Steps between knots add up to a second as independent ones do.
+    hz = (len(found.posterior.pose) - 1) * given.fps / max(given.frames - 1, 1)
+    steps = hz * np.diagonal(found.posterior.steps, axis1=1, axis2=2)
+    return {
+        "change": np.concatenate([moved, turned], axis=1),
+        "covariance": found.posterior.pose[near],
+        "steps": steps[np.minimum(near, len(steps) - 1)],
+    }
 
 
 def _left(errors: CameraErrors, steps: np.ndarray) -> CameraErrors:

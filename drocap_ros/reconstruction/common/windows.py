@@ -51,21 +51,35 @@ def over_windows(data: MethodInput, solve: Callable[[slice], ImagePoses]) -> Ima
     """Solve window by window and cross-fade the results where windows overlap."""
     frames, overlap = len(data.keypoints), data.adjuster.overlap_frames
     rows_of = windows(frames, data.adjuster.window_frames, overlap)
-    faded: dict[str, np.ndarray] = {}
-    weight = np.zeros(frames)
-    reports = []
+    faded, reports = Faded(frames), []
     for rows in rows_of:
         found = solve(rows)
         fade = fade_weights(rows, frames, overlap)
-        weight[rows] += fade
-        for name, values in (("in_image", found.in_image), ("sigma_px", found.sigma_px), ("still", found.still)):
-            if values is not None:
-                total = faded.setdefault(name, np.zeros((frames, *values.shape[1:])))
-                total[rows] += _along(fade, values) * values
+        faded.add(rows, fade, in_image=found.in_image, sigma_px=found.sigma_px, still=found.still)
         reports.append(found.report)
         data.progress("ba", rows.stop / frames)
-    mean = {name: total / _along(weight, total) for name, total in faded.items()}
-    return replace(ImagePoses.centred(**mean), spread=found.spread, report=_together(reports))
+    return replace(ImagePoses.centred(**faded.mean()), spread=found.spread, report=_together(reports))
+
+
+class Faded:
+    """Values of windows by name, faded into each other; ``weight`` : (F,), 0 = no window has the frame."""
+
+    def __init__(self, frames: int) -> None:
+        self.weight = np.zeros(frames)
+        self._sums: dict[str, np.ndarray] = {}
+
+    def add(self, rows: slice, fade: np.ndarray, **values: np.ndarray | None) -> None:
+        """Add those (R, ...) of a window with the weights (R,) of its frames; None is left out."""
+        self.weight[rows] += fade
+        for name, value in values.items():
+            if value is not None:
+                total = self._sums.setdefault(name, np.zeros((len(self.weight), *value.shape[1:])))
+                total[rows] += _along(fade, value) * value
+
+    def mean(self) -> dict[str, np.ndarray]:
+        """Those of all frames, 0 where there are none."""
+        weight = np.where(self.weight == 0.0, 1.0, self.weight)
+        return {name: total / _along(weight, total) for name, total in self._sums.items()}
 
 
 def _along(per_frame: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from drocap_ros.contacts import ANKLES
 from drocap_ros.geometry.rotations import exp_so3, pack_covariance
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
+from drocap_ros.reconstruction.common.windows import Faded
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.even_capture import (
@@ -37,7 +38,6 @@ from drocap_ros.reconstruction.world.world_model import (
     CALIBRATED,
     CAMERA,
     GLOBALS,
-    JOINTS,
     MEASURED,
     MISALIGNMENT,
     POSITION_LATENCY,
@@ -160,15 +160,24 @@ def refine_in_world(
         return refusal
     body = (poses.joints - origin) / poses.factor
     start, held = _start(stamp_ns, body, origin, 1.0 / poses.factor, before, config.errors.wander_s)
-    facts, faded = _Facts(), _Faded(len(capture.body), len(beside.views))
+    facts, faded = _Facts(), Faded(len(capture.body))
     for window, data, found in _adjusted(capture, windows, _Scene(matrix, config, start, held, known, beside)):
         telemetry = data.telemetry
-        faded.add(window, found, data)
+        views = enumerate(data.views)
+        faded.add(
+            window.rows,
+            window.fade,
+            joints=found.joints,
+            cameras=np.stack([_correction(found.state.of_view(n), v.telemetry) for n, v in views], axis=1),
+            wander=found.state.camera[:, :CAMERA],
+            place=np.broadcast_to(found.place, (len(found.joints), 3, 3)),
+            covariance=found.covariance + found.place,
+        )
         facts.add(window, found, telemetry, config.stature_std)
         last = found
     if config.checks and (refusal := facts.refusal()):
         return refusal
-    joints, cameras, wander, place, covariance = (values[capture.slot] for values in faded.mean())
+    joints, cameras, wander, place, covariance = (v[capture.slot] for v in faded.mean().values())
     joints += origin
     own, *further = np.moveaxis(cameras, 1, 0)
     return RefinedWorld(
@@ -245,28 +254,6 @@ def _adjusted(
         yield window, data, found
 
 
-class _Faded:
-    """Solutions of windows, faded into each other: joints, corrections of the camera, its wander, covariances."""
-
-    def __init__(self, slots: int, further: int = 0) -> None:
-        shapes = (JOINTS, 3), (1 + further, CAMERA), (CAMERA,), (3, 3), (JOINTS, 3, 3)
-        self._sums = [np.zeros((slots, *shape)) for shape in shapes]
-        self._weight = np.zeros(slots)
-
-    def add(self, window: CaptureWindow, found: WorldSolution, data: WorldInput) -> None:
-        views = enumerate(data.views)
-        cameras = np.stack([_correction(found.state.of_view(n), view.telemetry) for n, view in views], axis=1)
-        place = np.broadcast_to(found.place, (len(found.joints), 3, 3))
-        values = found.joints, cameras, found.state.camera[:, :CAMERA], place, found.covariance + found.place
-        for total, value in zip(self._sums, values, strict=True):
-            total[window.rows] += _per_frame(window.fade, value) * value
-        self._weight[window.rows] += window.fade
-
-    def mean(self) -> list[np.ndarray]:
-        weight = np.where(self._weight == 0.0, 1.0, self._weight)  # no window holds the slots of a pause
-        return [total / _per_frame(weight, total) for total in self._sums]
-
-
 class _Facts:
     """What the windows of a recording say about its telemetry."""
 
@@ -287,11 +274,6 @@ class _Facts:
         if not self._cost <= _LARGEST_COST:
             return Refusal(Why.POSITION_JUMPS)
         return Refusal(Why.NO_FOOT_RESTS) if self._contact < _LEAST_CONTACT else None
-
-
-def _per_frame(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Weights (F,) with as many axes as the values (F, ...)."""
-    return weight.reshape(-1, *(1,) * (values.ndim - 1))
 
 
 def _held_pelvis(before: Before, stamp_ns: int) -> np.ndarray:
