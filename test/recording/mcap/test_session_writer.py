@@ -91,6 +91,16 @@ def test_empty_session_is_whole(tmp_path):
             read_pose2d(session)
 
 
+@pytest.mark.parametrize("stamps", [(-1, 5), (5, -(2**40)), (1 << 64, 5)])
+def test_message_of_a_time_that_no_file_holds_is_counted_and_ends_no_recording(tmp_path, messages, capture, stamps):
+    message = messages.cdr(messages.pose2d(capture.tracks, 0, START_NS, 1))
+    with SessionWriter(tmp_path / "s") as writer:
+        writer.register("/drocap/pose2d", POSE2D, schema_text(POSE2D))
+        kept = [writer.write("/drocap/pose2d", message, *times) for times in ((START_NS,), stamps, (START_NS + 1,))]
+    assert kept == [True, False, True]
+    assert (writer.error, writer.dropped, writer.written) == (None, 1, 2)
+
+
 def test_non_empty_folder_is_refused(tmp_path):
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "notes.txt").write_text("mine")
