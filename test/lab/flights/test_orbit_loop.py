@@ -12,12 +12,23 @@ from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_
 WIND = (8.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-def test_orbit_in_wind_keeps_radius_heading_and_distance(autopilot):
-    settings = LoopSettings(autopilot=autopilot, action="stand", wind_m_s=WIND, seed=2, seconds=28)
+def _missed(autopilot: str, action: str):
+    """A case whose radius the truer simulated vehicles miss; the bound of 0.3 m stays."""
+    reason = "radius error above 0.3 m in wind since the simulated vehicles fly and report as the recorded ones"
+    return pytest.param(autopilot, action, marks=pytest.mark.xfail(reason=reason, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "action"),
+    [
+        ("ardupilot", "stand"), ("px4", "stand"), _missed("ardupilot", "walk"), _missed("px4", "walk"),
+    ],
+)  # fmt: skip
+def test_orbit_in_wind_keeps_radius_heading_and_distance(autopilot, action):
+    settings = LoopSettings(autopilot=autopilot, action=action, wind_m_s=WIND, seed=2, seconds=32)
     loop = OrbitLoop(with_config(settings, body_height_m=1.75))  # the other parameters have their defaults
     loop.start()
-    loop.run(27.0)
+    loop.run(31.0)
     quality = orbit_quality(loop, 6.0, 13.0)
     assert quality.orbiting == 1.0, loop.reasons[-3:]
     assert quality.radius_error_m <= 0.3

@@ -13,13 +13,15 @@ from lab.flights.pixel_loop import PixelOrbitLoop
 pytest.importorskip("onnxruntime")
 
 
-def test_orbit_by_rendered_images_keeps_the_person_in_the_picture():
-    settings = with_config(LoopSettings(seed=0, wind_m_s=(8.0, 0.0, 0.0), seconds=16.0), body_height_m=1.75)
+@pytest.mark.xfail(reason="the radius is not settled at 18 s by a vehicle as the recorded one", strict=True)
+def test_orbit_by_rendered_images_keeps_radius_and_heading():
+    settings = with_config(LoopSettings(seed=0, wind_m_s=(8.0, 0.0, 0.0), seconds=18.0), body_height_m=1.75)
     loop = PixelOrbitLoop(settings, PoseEstimator(models_folder(SIMULATION), PoseEstimatorConfig()))
     loop.start()
-    loop.run(16.0)
+    loop.run(18.0)
     assert loop.controller.safety.state == State.ORBITING, loop.reasons
     quality = orbit_quality(loop, 6.0, 13.0)
+    assert quality.radius_error_m < 0.3
     assert quality.yaw_error_deg < 3.0
     assert quality.in_middle_third > 0.95
     errors = np.array(loop.errors) / np.array(loop.heights_px)[:, None]
@@ -27,7 +29,7 @@ def test_orbit_by_rendered_images_keeps_the_person_in_the_picture():
     assert np.nanmean(errors) < 0.03
     # Images from many sides: a large part of a turn.
     bearings = np.unwrap([np.arctan2(*row.position[1::-1]) for row in loop.rows])
-    assert np.degrees(np.ptp(bearings)) > 120
+    assert np.degrees(np.ptp(bearings)) > 150
 
 
 def test_two_boxes_of_one_person_do_not_end_the_orbit():
