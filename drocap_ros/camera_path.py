@@ -1,4 +1,4 @@
-"""What is known of the camera of some images, how well, and what tells it; "nothing" is a value of it.
+"""What is known of the camera of some images: its path, its errors and their source; "nothing" is a value, too.
 
 Telemetry, the picture's fixed points, another person in the same images and the live graph all end in a
 :class:`CameraPath`; every step of a reconstruction reads it.
@@ -13,7 +13,7 @@ import numpy as np
 
 
 class Teller(Enum):
-    """What tells the camera."""
+    """Source of what is known of a camera."""
 
     NOTHING = auto()
     REPORTS = auto()  # as they are
@@ -40,7 +40,7 @@ class Kind(Enum):
 
 
 class UpSource(Enum):
-    """What tells where up is."""
+    """Source of the direction of up."""
 
     GROUND = "the plane of the ground's points under the feet"
     FEET = "the plane of resting feet"
@@ -82,7 +82,7 @@ class PictureFacts:
     residual_px : median of the points' residuals; covered : share of the frames with enough points
     position_std, turn_std_deg : of the path's change from knot to knot (an eighth of a second)
     drift : (F, 2) standard deviations of position and turn (rad) after the best similarity; None = unknown
-    up, up_std_deg : what tells up, None = nothing until now
+    up, up_std_deg : source of up and its deviation; None = there is none yet
     scale_std : of the logarithm of the path's metres, NaN = the camera keeps its place
     feet_tell : resting feet measured them
     """
@@ -182,7 +182,7 @@ class CameraPath:
 
     @property
     def of_reports(self) -> bool:
-        """Whether telemetry tells it: its world is that of the Earth."""
+        """Whether its source is telemetry: the world is that of the Earth."""
         return self.teller in (Teller.REPORTS, Teller.POINTS_AND_REPORTS)
 
     def of_images(self, use: np.ndarray | slice) -> CameraPath:

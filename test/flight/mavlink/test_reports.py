@@ -128,3 +128,27 @@ def test_after_a_gap_the_sequence_begins_again():
     estimator.update(old, S)
     estimator.update(restarted, 2 * S)
     assert estimator.modes.mode == "LOITER"
+
+
+def test_a_late_report_of_the_mode_before_is_no_news():
+    before, change, after = packets([heartbeat("LOITER"), heartbeat("LOITER"), current_mode("OFFBOARD")])
+    modes = read([before, after])
+    modes.take_heard()
+    estimator = VehicleStateEstimator()
+    for message in (before, after):
+        estimator.update(message, S)
+    estimator.modes.take_heard()
+    estimator.update(change, S + 1)
+    assert (estimator.modes.mode, estimator.modes.take_heard()) == ("OFFBOARD", frozenset())
+
+
+def test_a_late_report_of_a_mode_in_between_is_heard():
+    estimator = VehicleStateEstimator()
+    first, between, last = packets([heartbeat("OFFBOARD"), current_mode("RTL"), current_mode("OFFBOARD")])
+    for message in (first, last):
+        estimator.update(message, S)
+    estimator.modes.take_heard()
+    age_s = estimator.modes.age_s(2 * S)
+    estimator.update(between, S + 10)
+    assert (estimator.modes.mode, estimator.modes.take_heard()) == ("OFFBOARD", {"RTL"})
+    assert estimator.modes.age_s(2 * S) == age_s

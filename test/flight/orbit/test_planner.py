@@ -242,3 +242,10 @@ def test_orbit_turns_its_direction_inside_all_limits(changes, turns_s):
     assert np.abs(np.diff(omega)).max() < 1.5 * 19.0 / config.ramp_s * 2.5 * DT
     assert max(accelerations) <= config.max_acceleration_m_s2
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() / DT < 2.05
+
+
+def test_nan_in_a_command_keeps_the_present_value():
+    config = OrbitConfig()
+    goal = goal_of(config, radius_m=8.0)
+    assert goal.height_m == 2.5
+    assert goal_of(config, height_m=4.0, present=goal) == (8.0, 4.0, goal.angular_speed_rad_s)

@@ -566,3 +566,11 @@ def test_orbit_ends_before_the_vehicle_cannot_stop_any_more():
     assert subject_condition(near, LIMITS).code == ConditionCode.SUBJECT_NEAR
     assert reduce(orbiting(), near, 1.0, None, LIMITS)[0].state == State.HOLDING
     assert subject_condition(seen(5.8, closing_m_s=2.5, approach_m_s=-1.0), LIMITS) is None
+
+
+def test_where_the_speed_decides_the_words_of_a_near_subject_name_its_share():
+    near = changed(GOOD, subject_distance_m=7.1, closing_m_s=4.0)
+    words = str(reduce(orbiting(), near, 1.0, None, LIMITS)[0].condition)
+    room_m = float(words.split("the last ")[1].split(" m")[0])
+    assert "7.1 m away" in words
+    assert 7.1 - room_m < 3.0
