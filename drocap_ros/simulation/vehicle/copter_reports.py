@@ -144,6 +144,7 @@ class Body:
         ])  # fmt: skip
 
 
+_YAW_WANDERS_S = 20.0  # within 10 to 60 s: recorded
 _GPS_NOTICED_S = 0.4  # from the loss of satellites to its report: measured
 EKF_NOTICED_S = 7.4  # from the loss of satellites to the estimator's report: measured
 _CONSTANT_POSITION = ESTIMATOR_HEALTHY & ~(8 | 16) | 128
@@ -165,6 +166,7 @@ class CopterSetup(NamedTuple):
 
     wind : (3,) m/s
     estimate_error : of the estimate, as a share of the recorded ones
+    yaw_error_deg : standard deviation of the heading's error, which wanders within 20 s; PX4's was 4 to 19 at worst
     timeout_s : its own time-out without setpoints
     mode : at first; "" = that of the sticks
     mount : of the camera; None = a gimbal, level
@@ -176,6 +178,7 @@ class CopterSetup(NamedTuple):
     seed: int = 0
     estimate_error: float = 1.0
     attitude_error_deg: float = 0.4
+    yaw_error_deg: float = 0.0
     timeout_s: float = 0.5
     mode: str = "LOITER"
     mount: SimulatedMount | None = None
@@ -203,6 +206,8 @@ class ReportingCopter(SimulatedVehicle):
         # The estimate of the body leans wrongly by as much as that of a gimbal.
         lean = np.array([*(0.5 * self._attitude_error[:2]), 0.0, 1.0])
         self._lean_error = lean / np.linalg.norm(lean)
+        self.yaw_error = 0.0  # rad, estimate less truth
+        self._yaw_sd, self._yaw_rng = math.radians(setup.yaw_error_deg), np.random.default_rng([setup.seed, 0xC3])
         self._report: VehiclePose | None = None
         self._report_s = -1.0
 
@@ -223,6 +228,13 @@ class ReportingCopter(SimulatedVehicle):
         estimate: np.ndarray = self.body.position + self.error.position
         return estimate
 
+    def _wander(self, dt: float) -> None:
+        """Let the heading's error wander."""
+        if self._yaw_sd > 0.0:
+            share = math.exp(-dt / _YAW_WANDERS_S)
+            push = self._yaw_sd * math.sqrt(1.0 - share**2) * float(self._yaw_rng.standard_normal())
+            self.yaw_error = share * self.yaw_error + push
+
     def at(self, t_s: float) -> VehiclePose:
         """Reported pose: the estimate, not the truth."""
         if self._report is not None and (self.frozen or t_s == self._report_s):
@@ -232,11 +244,16 @@ class ReportingCopter(SimulatedVehicle):
         self._report = VehiclePose(
             self.estimate,
             self.body.velocity + self.error.velocity,
-            quaternion_multiply(body, self._lean_error),
+            quaternion_multiply(self._turned(body), self._lean_error),
             np.array([0.0, 0.0, self.body.yaw_rate]),
             self.mount.camera(body),
         )
         return self._report
+
+    def _turned(self, body: np.ndarray) -> np.ndarray:
+        """The body's orientation (4,), turned by the error of the heading."""
+        half = 0.5 * self.yaw_error
+        return quaternion_multiply(np.array([0.0, 0.0, math.sin(half), math.cos(half)]), body) if half else body
 
     def camera_orientation(self) -> np.ndarray:
         """(4,) camera FLU -> ENU, truth."""
