@@ -279,7 +279,7 @@ class OrbitController:
             condition=self._orbit.flown_condition(present, seen) if orbiting else present,
             failed=self.safety.failed if isinstance(self.safety, Idle) else None,
             mode_failure=self._queue.failure(SET_MODE),
-            way_out=way_out(self.safety, seen, mode_change_allowed=self._config.mode_change_allowed),
+            way_out=way_out(self.safety, seen, self._limits),
             answers=self._desk.take_answers(),
             radius_m=distance_m,
             height_m=vehicle.height_m,

@@ -69,12 +69,10 @@ def reduce(
     -------
     The next state, and what may be sent until the step after it.
     """
-    vehicle = vehicle_condition(seen, limits)
-    place = None if vehicle else limit_condition(seen, _fence(state), limits)
-    problem = vehicle or place or subject_condition(seen, limits) or start_condition(seen)
     state = watch(state, seen, now_s, limits)
     sight = state.sight
     state = _by_mode(state, seen, now_s)
+    vehicle, place, problem = _problems(state, seen, limits)
     answer = None
     if command is not None:
         state, answer = _execute(state, seen, now_s, command, problem, limits)
@@ -89,6 +87,15 @@ def reduce(
         state = _hold(state, seen, now_s, problem, limits, astray=bool(vehicle or place))
     state = dataclasses.replace(state, sight=sight)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
+
+
+def _problems(
+    state: SafetyState, seen: Observed, limits: Limits
+) -> tuple[Condition | None, Condition | None, Condition | None]:
+    """Why vehicle and place forbid motion, and the first cause of all that no orbit may begin."""
+    vehicle = vehicle_condition(seen, limits)
+    place = None if vehicle else limit_condition(seen, _fence(state), limits)
+    return vehicle, place, vehicle or place or subject_condition(seen, limits) or start_condition(seen)
 
 
 def _fence(state: SafetyState) -> np.ndarray | None:
@@ -107,8 +114,9 @@ def _by_mode(state: SafetyState, seen: Observed, now_s: float) -> SafetyState:
     if not state.sight.lost and not seen.health.armed and seen.mode.name:
         return Idle(now_s, condition(_C.DISARMED))
     if seen.mode.in_hold:
-        # Once the autopilot holds, any other mode is somebody's choice.
-        return dataclasses.replace(state, modes=frozenset({seen.mode.name}))
+        # Once the autopilot holds, any other mode is somebody's choice, and the next orbit has a fence of its own.
+        fence = None if isinstance(state, Holding) else state.fence_centre
+        return dataclasses.replace(state, modes=frozenset({seen.mode.name}), fence_centre=fence)
     return state
 
 
@@ -228,11 +236,11 @@ def _start_refusal(state: SafetyState, seen: Observed, problem: Condition | None
 
 def _request_refusal(seen: Observed, command: Command, limits: Limits) -> CommandAnswer | None:
     """Why control may not be requested from the autopilot."""
-    if command == Command.START:
-        return _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=by_hand(seen))
     if not limits.safety.mode_change_allowed:
         engaged = f" ({seen.autopilot.hints.engaged})" if seen.autopilot.hints.engaged else ""
         return _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode.name, engaged=engaged, by_hand=by_hand(seen))
+    if command == Command.START:
+        return _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=by_hand(seen))
     if seen.link.packet_loss > MAX_LOSS:
         return _refused(_C.PACKETS_LOST, lost_percent=100 * seen.link.packet_loss, most_percent=100 * MAX_LOSS)
     return None
@@ -336,16 +344,22 @@ def by_hand(seen: Observed) -> str:
     return f", or {seen.autopilot.hints.by_hand}" if seen.autopilot.hints.by_hand else ""
 
 
-def way_out(state: SafetyState, seen: Observed, *, mode_change_allowed: bool) -> str:
-    """What the operator may do next, as a sentence; "" = nothing leads out, or the condition says it."""
+def way_out(state: SafetyState, seen: Observed, limits: Limits) -> str:
+    """What the operator may do next, as a sentence; "" = nothing leads out, or the condition says it.
+
+    A command that it names is accepted now.
+    """
     if isinstance(state, TakenOver | Fault):
         return "`drocap orbit stop` acknowledges it, and nothing begins before"
     if not isinstance(state, Ready | Holding):
         return ""
-    if not seen.mode.in_control:
-        hand = by_hand(seen).removeprefix(", or ")
-        if mode_change_allowed:
-            return f"`drocap orbit engage` requests control and begins an orbit{by_hand(seen)}"
-        return f"{hand}, then `drocap orbit start`" if hand else "engage needs mode_change_allowed"
+    command = Command.START if seen.mode.in_control else Command.ENGAGE
+    refused = _start_refusal(state, seen, _problems(state, seen, limits)[2])
+    if refused is None and command == Command.ENGAGE:
+        refused = _request_refusal(seen, command, limits)
+    if refused is not None:
+        return "" if refused.condition.code == state.condition.code else str(refused.condition)
+    if command == Command.ENGAGE:
+        return f"`drocap orbit engage` requests control and begins an orbit{by_hand(seen)}"
     silent = isinstance(state, Holding) and stream_ended(seen)
     return ("nothing is sent any more; " if silent else "") + "`drocap orbit start` begins an orbit"
