@@ -112,7 +112,12 @@ class SubjectConfig(Parameters):
 
     body_height_m: float = param(1.7, "assumed height of the subject", "m", 0.5, 2.5)
     ground_height_m: float = param(
-        0.0, "height of the subject's ground in the map frame; 0 = where the local frame begins", "m", -500, 500
+        0.0,
+        "CHANGE: height of the subject's ground in the autopilot's local frame, up: of the take-off place, as "
+        "preflight reads it on the ground, and how much higher he stands",
+        "m",
+        -500,
+        500,
     )
     use_ground_plane: bool = param(True, "use the range of the feet on level ground too; switch off on slopes")
     size_error: float = param(

@@ -126,11 +126,13 @@ class ConditionCode(enum.IntEnum):
     # Limits of place and speed
     TOO_FAST = 150, "speed of {speed_m_s:.1f} m/s above the limit"
     TOO_HIGH = 151, "height of {height_m:.1f} m at the limit of {limit_m:g} m"
-    TOO_LOW = 152, "height of {height_m:.1f} m at the lower limit of {limit_m:g} m"
+    TOO_LOW = 152, "height of {height_m:.1f} m, {source}, at the lower limit of {limit_m:g} m"
     AT_FENCE = 153, "{distance_m:.1f} m from where the orbit began: at the fence of {limit_m:g} m"
     COAST_UNSAFE = 154, "if the bridge failed now, the vehicle would {reach} before it stands"
     ORBIT_NOT_KEPT = 155, ("the vehicle has been more than {limit_m:.1f} m from its place on the orbit for {for_s:.0f} "
         "s, {away_m:.1f} m now: {verdict}")
+    HEIGHT_CONTRADICTED = 156, ("the vehicle is {height_m:.1f} m above the subject's ground as reported, and "
+        "{other_m:.1f} m {source}: set ground_height_m to that ground and body_height_m to the subject")
     # Subject
     NO_SUBJECT = 200, "no subject is tracked"
     SUBJECT_OUTDATED = 201, "the subject was last located {ago}"

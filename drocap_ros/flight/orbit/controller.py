@@ -282,7 +282,7 @@ class OrbitController:
             way_out=way_out(self.safety, seen, self._limits),
             answers=self._desk.take_answers(),
             radius_m=distance_m,
-            height_m=vehicle.height_m,
+            height_m=vehicle.height.m,
             angular_speed_deg_s=omega,
             radius_error_m=distance_m - self._orbit.goal.radius_m if orbiting else math.nan,
             yaw_error_deg=yaw_error,

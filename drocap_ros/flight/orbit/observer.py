@@ -14,7 +14,18 @@ from drocap_ros.flight.autopilot.autopilot import UNKNOWN
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.observed import Course, Health, Link, Mode, Motion, Observed, Pictures, SizeSight, Subject
+from drocap_ros.flight.observed import (
+    Course,
+    Health,
+    Height,
+    Link,
+    Mode,
+    Motion,
+    Observed,
+    Pictures,
+    SizeSight,
+    Subject,
+)
 from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.guard import Guard
@@ -230,7 +241,8 @@ def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: Veh
             position=position,
             velocity=np.asarray(velocity, float),
             yaw=_yaw(vehicle),
-            height_m=float(position[2]) - config.ground_height_m,
+            height=Height(float(position[2]) - config.ground_height_m, config.height_error_m),
+            clearance_m=estimator.clearance_m(now_ns) * float(matrix_from_quaternion(vehicle.orientation_xyzw)[2, 2]),
             age_s=abs(age_s),
             position_age_s=position_age_s,
         ),
@@ -255,7 +267,7 @@ def _subject(estimate: SubjectEstimate, offset: np.ndarray, motion: Motion, by_s
         contradicted=estimate.contradicted or (by_size is not None and by_size.contradicted),
         sd_m=estimate.position_sd_m,
         nearer=estimate.nearer,
-        size_over_ground=estimate.size_over_ground,
+        ground=Height(estimate.ground.m + float(offset[2]), estimate.ground.sd_m),
         distance_m=distance if by_size is None else min(distance, by_size.farthest_m),
         closing_m_s=-float(sight @ motion.velocity[:2]) / max(distance, 1e-3),
         approach_m_s=float(sight @ estimate.velocity[:2]) / max(distance, 1e-3),

@@ -11,7 +11,7 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.motion_checks import LANDED_STATES, battery_condition, loss_condition
 from drocap_ros.flight.preflight.findings import LASTING, Finding, Measured, Stream, Values, Verdict, check, graded
-from drocap_ros.flight.vehicle import LANDED_IN_AIR, SATELLITES_UNKNOWN, VehicleState
+from drocap_ros.flight.vehicle import LANDED_IN_AIR, LANDED_ON_GROUND, SATELLITES_UNKNOWN, VehicleState
 
 _C = ConditionCode
 _CAMERA = (_C.CAMERA_UNKNOWN, _C.MOUNT_TYPE_UNKNOWN, _C.MOUNT_OUTDATED)
@@ -41,6 +41,8 @@ def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: V
     yield _satellites(vehicle)
     yield _estimator(vehicle)
     yield _battery(config, vehicle, autopilot)
+    if vehicle.landed_state == LANDED_ON_GROUND and math.isfinite(vehicle.position_enu_m[2]):
+        yield _ground(config, vehicle)
     yield _phase(vehicle)
     if not _flies(vehicle):
         yield from _waiting(autopilot)
@@ -197,6 +199,16 @@ def _estimator(vehicle: VehicleState) -> Verdict:
     found = "healthy" if vehicle.position_ok else "not usable"
     remedy = "wait for the autopilot's estimator; see its messages in the ground station"
     return Verdict(graded(missing=not vehicle.position_ok), found, "healthy", remedy)
+
+
+@check("ground_height_m", "the subject's ground", _C.HEIGHT_CONTRADICTED, _C.TOO_LOW)
+def _ground(config: MavlinkBridgeConfig, vehicle: VehicleState) -> Verdict:
+    """The height that is reported on the ground, where the subject's ground is usually level with it."""
+    stands_m, stated_m = float(vehicle.position_enu_m[2]), config.ground_height_m
+    found = f"the vehicle stands at {stands_m:.1f} m in the autopilot's frame, ground_height_m is {stated_m:g}"
+    remedy = f"set ground_height_m to {stands_m:.1f} where the subject stands as high as the vehicle does now"
+    level = graded(warning=abs(stands_m - stated_m) > config.height_error_m)
+    return Verdict(level, found, f"within {config.height_error_m:g} m", remedy, {"stands_m": stands_m})
 
 
 @check("battery", "battery", _C.BATTERY_UNKNOWN, _C.BATTERY_LOW)

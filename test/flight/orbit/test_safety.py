@@ -14,6 +14,7 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.bridge_config import SafetyConfig
 from drocap_ros.flight.conditions import ConditionCode, condition
+from drocap_ros.flight.observed import Height
 from drocap_ros.flight.orbit.motion_checks import battery_condition, stopping_room, subject_condition
 from drocap_ros.flight.orbit.safety import by_hand, permit_mode, reduce, way_out
 from drocap_ros.flight.orbit.states import (
@@ -51,6 +52,9 @@ BAD = {
     "too high": {"height_m": 21.0},
     "climbing to the limit": {"height_m": 18.5, "velocity": np.array([0, 0, 2.5])},
     "too low": {"height_m": 1.0},
+    "low by a range finder": {"clearance_m": 1.1},
+    "low by the image": {"ground": Height(1.4, 0.2)},
+    "height contradicted": {"ground": Height(-3.0, 0.2), "height_m": 6.0, "position": np.array([6.0, 0, 1.0])},
     "subject none": {"subject": None},
     "subject old": {"subject_age_s": 1.1},
     "subject from the future": {"subject_age_s": -1.0},
@@ -84,6 +88,9 @@ CODES = {
     "too high": ConditionCode.TOO_HIGH,
     "climbing to the limit": ConditionCode.TOO_HIGH,
     "too low": ConditionCode.TOO_LOW,
+    "low by a range finder": ConditionCode.TOO_LOW,
+    "low by the image": ConditionCode.TOO_LOW,
+    "height contradicted": ConditionCode.HEIGHT_CONTRADICTED,
     "subject none": ConditionCode.NO_SUBJECT,
     "subject old": ConditionCode.SUBJECT_OUTDATED,
     "subject from the future": ConditionCode.SUBJECT_OUTDATED,
@@ -604,3 +611,11 @@ def test_where_the_speed_decides_the_words_of_a_near_subject_name_its_share():
     room_m = float(words.split("the last ")[1].split(" m")[0])
     assert "7.1 m away" in words
     assert 7.1 - room_m < 3.0
+
+
+def test_a_body_that_seems_small_forbids_a_start_and_ends_no_orbit():
+    crouching = changed(GOOD, ground=Height(-2.0, 0.3))  # 4.5 m by the image, 2.5 m as reported
+    _, decision = reduce(Idle(), crouching, 0.0, Command.START, LIMITS)
+    assert decision.answer.condition.code == ConditionCode.HEIGHT_CONTRADICTED
+    state, _ = reduce(orbiting(), crouching, 1.0, None, LIMITS)
+    assert state.state == State.ORBITING

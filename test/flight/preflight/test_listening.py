@@ -259,6 +259,13 @@ def test_health_of_the_vehicle(autopilot):
     assert scene.findings["battery"].found.startswith("12 %")
 
 
+def test_an_origin_that_is_not_where_the_vehicle_stands_is_named():
+    found = Scene("px4", dataclasses.replace(CONFIG, ground_height_m=-2.8)).findings["ground_height_m"]
+    assert found.level == Level.WARNING
+    assert found.values["stands_m"] == pytest.approx(0.0, abs=0.4)
+    assert Scene("px4").findings["ground_height_m"].level == Level.OK
+
+
 def test_a_battery_monitor_without_a_charge_is_named():
     scene = Scene("ardupilot", before=lambda scene: setattr(scene.copter, "battery", -1))
     assert "battery" in scene.missing()
