@@ -77,9 +77,6 @@ class SafetyConfig(Parameters):
     blind_hold_s: float = param(
         3.5, "longest hold while telemetry is silent or late: braking from 4.5 m/s takes 3.5 s", "s", 0.5, 30
     )
-    resume_after_hold_s: float = param(
-        0.0, "from the beginning of a hold by old data, in which the orbit may resume by itself; 0 = never", "s", 0, 30
-    )
     engage_timeout_s: float = param(
         5.0, "time for the autopilot to enter GUIDED or OFFBOARD after `engage`", "s", 1, 30
     )

@@ -205,6 +205,7 @@ class Observed:
     loss_settings : the autopilot's settings for the loss of setpoints
     intruder : another one that commands, or whose keypoints would be followed
     disturbance : a condition that ends motion and that no other field shows
+    stalled_s : for how long our own loop has just stood still; 0 = it has not, and a long stand is a disturbance too
     refusal : why the autopilot does not enter the requested mode, as a sentence; "" = it does not refuse
     """
 
@@ -220,6 +221,7 @@ class Observed:
     course: Course = Course()
     intruder: Condition | None = None
     disturbance: Condition | None = None
+    stalled_s: float = 0.0
     refusal: str = ""
 
     @property

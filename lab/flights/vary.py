@@ -50,7 +50,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "stature_m": (1.75, 0.9, 2.0), "fence_radius_m": (40.0, 8.0, 20.0), "radius_m": (6.0, 3.8, 10.0),
     "height_m": (2.5, 1.8, 5.0), "angular_speed_deg_s": (19.0, -25.0, 25.0), "body_height_m": (1.7, 1.2, 2.1),
     "size_error": (0.08, 0.04, 0.12), "use_ground_plane": (True, [False]), "timeout_s": (0.5, 0.3, 0.5),
-    "control_hz": (20.0, 10.0, 40.0), "resume_after_hold_s": (0.0, 1.0, 5.0), "height_error_m": (0.0, -5.0, 5.0),
+    "control_hz": (20.0, 10.0, 40.0), "height_error_m": (0.0, -5.0, 5.0),
     "estimate_error": (1.0, 0.0, 5.0), "attitude_error_deg": (0.4, 0.0, 2.0), "yaw_error_deg": (0.0, 0.0, 10.0),
     "down_delay_s": (0.01, 0.0, 0.3), "up_delay_s": (0.01, 0.0, 0.3), "jitter_s": (0.0, 0.0, 0.1),
     "loss": (0.0, 0.0, 0.3), "gaps_hz": (0.0, 0.0, 2.0), "mode_s": (0.0, 0.05, 1.0), "attitude_s": (0.0, 0.02, 0.2),
@@ -226,7 +226,7 @@ def settings_of(drawn: Draw) -> LoopSettings:
              "perception_hz", "latency_s", "late_share", "stamp_late_s", "gaps_hz", "estimate_error",
              "attitude_error_deg", "yaw_error_deg"),
             ("radius_m", "height_m", "angular_speed_deg_s", "body_height_m", "size_error", "use_ground_plane",
-             "control_hz", "resume_after_hold_s"),
+             "control_hz"),
         )
     )  # fmt: skip
     wind = drawn.wind_m_s * math.cos(drawn.seed), drawn.wind_m_s * math.sin(drawn.seed), 0.0

@@ -84,7 +84,6 @@ def begin_hold(
         blind=blind and not fresh,
         retreats=retreats,
         hold_mode_s=None if seen.course.followed else now_s,
-        resumable=reason.code in _HARMLESS,
         jumped_s=now_s if seen.jumped else -math.inf,
     )
 
@@ -155,20 +154,6 @@ def update_hold(state: Holding, seen: Observed, now_s: float, blind: bool) -> Ho
     return Fault(**{**vars(state), "since_s": now_s, "condition": reason})
 
 
-def resumption(
-    state: Holding, seen: Observed, now_s: float, problem: Condition | None, config: SafetyConfig
-) -> Holding:
-    """Note since when all is clear in a hold that may end by itself; any other cause takes this permission away."""
-    if not state.resumable:
-        return state
-    over = now_s - state.since_s > config.resume_after_hold_s or seen.mode.in_hold or not seen.mode.in_control
-    if over or (problem is not None and problem.code not in _HARMLESS):
-        return dataclasses.replace(state, resumable=False, clear_s=None)
-    if problem is not None:
-        return dataclasses.replace(state, clear_s=None)
-    return state if state.clear_s is not None else dataclasses.replace(state, clear_s=now_s)
-
-
 def retreat(state: Holding, seen: Observed, now_s: float, limits: Limits) -> Holding:
     """Move the hold position away from an approaching subject, at most to the fence, and never nearer to the subject.
 
@@ -197,8 +182,6 @@ def request_hold_mode(state: Holding, seen: Observed, now_s: float, config: Safe
     """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``; not on a lossy link."""
     awaited = not isinstance(state, Fault) and state.hold_mode_s is None and not state.sight.lost
     if not awaited or state.blind or seen.link.packet_loss > MAX_LOSS:
-        return state
-    if state.resumable and now_s - state.since_s <= config.resume_after_hold_s:
         return state
     slow = bool(np.linalg.norm(seen.vehicle.velocity) < _AT_REST_M_S)
     if slow == (state.slow_s is None):

@@ -45,6 +45,7 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
     oldest_s = oldest_state_s(safety, patient=patient)
     return (
         seen.disturbance
+        or (stalled_condition(seen) if seen.stalled_s and not patient else None)
         or _autopilot_condition(seen, limits, oldest_s)
         or _state_condition(seen, safety, oldest_s)
         or _health_condition(seen, safety)
@@ -52,6 +53,11 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
         or seen.pictures.camera_problem
         or seen.intruder
     )
+
+
+def stalled_condition(seen: Observed) -> Condition:
+    """That our own loop stood still."""
+    return condition(_C.CONTROL_LOOP_STALLED, gap_s=seen.stalled_s)
 
 
 def _autopilot_condition(seen: Observed, limits: Limits, oldest_s: float) -> Condition | None:

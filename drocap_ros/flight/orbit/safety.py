@@ -17,7 +17,6 @@ from drocap_ros.flight.orbit.hold import (
     is_silent,
     mode_visible,
     request_hold_mode,
-    resumption,
     retreat,
     stream_ended,
     update_hold,
@@ -53,7 +52,6 @@ from drocap_ros.flight.orbit.watchdog import GIVE_UP_S
 
 _C = ConditionCode
 _BLIND_MODE_REQUEST_S = 2.0  # of velocity zero, from 2.5 m/s at braking_m_s2: a brake by the mode takes longer
-_CLEAR_S = 1.0  # for which all conditions hold before an orbit resumes by itself
 _INTENTION_S = 2.0 / CURRENT_MODE_HZ  # two periods of CURRENT_MODE, which says what is intended
 
 
@@ -84,7 +82,8 @@ def reduce(
         state = _wait(state, seen, now_s, problem, limits)
     elif isinstance(state, Holding) and not stream_ended(seen):
         state = update_hold(state, seen, now_s, vehicle is not None)
-        state = _hold(state, seen, now_s, problem, limits, astray=bool(vehicle or place))
+        moved = state if vehicle or place else retreat(state, seen, now_s, limits)
+        state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
     state = dataclasses.replace(state, sight=sight)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
 
@@ -145,19 +144,6 @@ def _orbit(state: Orbiting, seen: Observed, now_s: float, blind: bool, limits: L
     elif pace.value == 1.0:
         reason = condition(_C.ORBITING)
     return dataclasses.replace(state, pace=pace, condition=reason)
-
-
-def _hold(
-    state: Holding, seen: Observed, now_s: float, problem: Condition | None, limits: Limits, *, astray: bool
-) -> SafetyState:
-    """Retreat, hand over or resume; ``astray``: vehicle or place forbid motion."""
-    moved = state if astray else retreat(state, seen, now_s, limits)
-    state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
-    state = resumption(state, seen, now_s, problem, limits.safety)
-    clear = state.clear_s is not None and state.clear_s <= now_s - _CLEAR_S
-    if clear and seen.mode.in_control and not state.sight.lost:
-        return dataclasses.replace(_begin_orbit(seen, now_s), fence_centre=state.fence_centre)
-    return state
 
 
 def _ending(state: SafetyState, seen: Observed, limits: Limits) -> Condition | None:
@@ -256,7 +242,7 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
         answer = _accepted(_C.STOPPED if requested else _C.ACKNOWLEDGED)
         return Idle(now_s, answer.condition, asked_s=now_s if requested else -math.inf), answer
     if isinstance(state, Holding):
-        return dataclasses.replace(state, resumable=False), _accepted(_C.ALREADY_HOLDING)
+        return state, _accepted(_C.ALREADY_HOLDING)
     return state, _accepted(_C.NOT_ORBITING)
 
 

@@ -30,6 +30,7 @@ from drocap_ros.flight.orbit.motion_checks import (
     oldest_state_s,
     oldest_subject_s,
     outdated_condition,
+    stalled_condition,
 )
 from drocap_ros.flight.orbit.states import Limits, Pace
 from drocap_ros.flight.subject.guard import farness
@@ -132,7 +133,7 @@ class Allowed(NamedTuple):
 
 
 def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
-    """The pace by the greatest age, relative to its limits, of subject, attitude, position and link."""
+    """The pace by the greatest age, relative to its limits, of subject, attitude, position, link and our own loop."""
     safety = limits.safety
     usual_s = safety.max_state_age_s
     halt_s = 0.5 * (usual_s + oldest_state_s(safety, patient=True))
@@ -144,6 +145,9 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
     pace = _share(seen.subject.age_s, usual_subject_s, subject_s)
     if pace < allowed.pace:
         allowed = Allowed(pace, outdated_condition(seen, usual_subject_s))
+    pace = _share(seen.stalled_s, 0.0, halt_s)
+    if pace < allowed.pace:
+        allowed = Allowed(pace, stalled_condition(seen))
     for age_s, code in (
         (seen.link.age_s, _C.LINK_SILENT),
         (seen.vehicle.age_s, _C.ATTITUDE_OUTDATED),
