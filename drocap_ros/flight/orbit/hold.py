@@ -160,7 +160,8 @@ def retreat(state: Holding, seen: Observed, now_s: float, limits: Limits) -> Hol
     Only a subject that is located counts, and only until the autopilot's hold mode has been requested.
     """
     place, subject, fence, safety = state.position, seen.subject.position, state.fence_centre, limits.safety
-    if place is None or subject is None or fence is None or not _may_retreat(state, seen, safety):
+    settled = not state.retreats or state.blind or state.hold_mode_s is not None or seen.mode.in_hold
+    if place is None or subject is None or fence is None or settled or not subject_located(seen, safety):
         return state
     wanted = limits.orbit.min_distance_m + seen.subject.sd_m + _LEAD_S * max(seen.subject.approach_m_s, 0.0) + _CLEAR_M
     if not seen.subject.distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
@@ -171,11 +172,6 @@ def retreat(state: Holding, seen: Observed, now_s: float, limits: Limits) -> Hol
     step *= min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
     target = here[:2] + _share_inside(here, step, fence, safety.fence_radius_m) * step
     return dataclasses.replace(state, position=np.append(target, place[2]), retreated_s=now_s)
-
-
-def _may_retreat(state: Holding, seen: Observed, safety: SafetyConfig) -> bool:
-    settled = state.blind or state.hold_mode_s is not None or seen.mode.in_hold
-    return state.retreats and not settled and subject_located(seen, safety)
 
 
 def request_hold_mode(state: Holding, seen: Observed, now_s: float, config: SafetyConfig) -> Holding:
@@ -212,11 +208,6 @@ def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> S
     # The vehicle is held where it is now, and not led back: setpoints may have ended, or its position been reset.
     known = bool(np.isfinite(seen.vehicle.position).all()) and seen.health.located
     return dataclasses.replace(state, position=seen.vehicle.position.copy() if known else None, yaw=seen.vehicle.yaw)
-
-
-def is_silent(state: SafetyState, now_s: float, limits: Limits) -> bool:
-    """Whether the vehicle has been out of sight for so long that nothing is sent any more."""
-    return state.sight.lost_s is not None and now_s - state.sight.lost_s > limits.safety.blind_hold_s
 
 
 def mode_visible(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> bool:

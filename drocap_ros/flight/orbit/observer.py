@@ -53,6 +53,7 @@ class OwnFlight(NamedTuple):
     unsafe : why the setpoint of the last step was not sent
     intruder : another one that commands or is followed, found in the graph
     refusal : why the autopilot does not enter the requested mode, as a sentence; "" = it does not refuse
+    operator_age_s : since the last sign of the operator
     """
 
     orbiting_s: float = 0.0
@@ -61,6 +62,7 @@ class OwnFlight(NamedTuple):
     unsafe: Condition | None = None
     intruder: Condition | None = None
     refusal: str = ""
+    operator_age_s: float = math.inf
 
 
 class Observer:
@@ -158,6 +160,7 @@ class Observer:
             intruder=own.intruder,
             disturbance=disturbance,
             refusal=own.refusal,
+            operator_age_s=own.operator_age_s,
         )
         # Within this step the process may have stood still too: what was read above belongs to different instants.
         stood_s = max(dt, link.decision_age_s())

@@ -14,7 +14,6 @@ from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.hold import (
     begin_hold,
     foreign_mode,
-    is_silent,
     mode_visible,
     request_hold_mode,
     retreat,
@@ -133,6 +132,8 @@ def _returned(state: SafetyState, seen: Observed) -> bool:
 def _orbit(state: Orbiting, seen: Observed, now_s: float, blind: bool, limits: Limits) -> SafetyState:
     """Slow the orbit down by the age of the data, or end it."""
     problem = _ending(state, seen, limits) or keeping_condition(seen, limits)
+    if 0.0 < (limit_s := limits.safety.max_orbit_s) < now_s - state.since_s:
+        problem = problem or condition(_C.ORBIT_TIME_OVER, limit_s=limit_s)
     if problem:
         near = problem.code == _C.SUBJECT_NEAR
         return begin_hold(state, problem, seen, now_s, limits.safety.fence_radius_m, blind=blind, retreats=near)
@@ -183,6 +184,8 @@ def permit_mode(state: SafetyState, mode: str) -> SafetyState:
 def _execute(
     state: SafetyState, seen: Observed, now_s: float, command: Command, problem: Condition | None, limits: Limits
 ) -> tuple[SafetyState, CommandAnswer]:
+    if command == Command.PRESENT:
+        return state, _accepted(_C.NONE)
     state = dataclasses.replace(state, failed=None, asked_s=-math.inf) if isinstance(state, Idle) else state
     if command == Command.STOP:
         return _stop(state, seen, now_s, limits)
@@ -295,7 +298,8 @@ def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits)
         own_loss, warm = seen.mode.left_by_itself, now_s - state.since_s >= limits.warm_up_s
         wanted = warm and not own_loss and start_condition(seen) is None and mode_visible(state, seen, now_s, limits)
         return Action.HOLD, ModeRequest.CONTROL if wanted else ModeRequest.NONE
-    silent = not seen.mode.in_control or is_silent(state, now_s, limits) or stream_ended(seen)
+    unseen_s = 0.0 if state.sight.lost_s is None else now_s - state.sight.lost_s
+    silent = not seen.mode.in_control or unseen_s > limits.safety.blind_hold_s or stream_ended(seen)
     if isinstance(state, Holding) and not silent:
         return _permitted_in_hold(state, seen, now_s, limits)
     return Action.NOTHING, ModeRequest.NONE

@@ -31,6 +31,7 @@ class Command(enum.IntEnum):
     START = 1
     ADJUST = 2
     ENGAGE = 3
+    PRESENT = 16
 
 
 class Action(enum.Enum):
