@@ -215,6 +215,7 @@ class Hints(NamedTuple):
     battery : settings of a battery monitor with a current sensor
     by_hand : how the pilot enters the control mode; "" = the pilot cannot
     engaged : why the operator has to engage instead
+    limits : what orbits under it cannot do yet
     """
 
     port: str = ""
@@ -222,6 +223,7 @@ class Hints(NamedTuple):
     battery: str = ""
     by_hand: str = ""
     engaged: str = ""
+    limits: str = ""
 
 
 # Of an unknown autopilot: nothing flies it.

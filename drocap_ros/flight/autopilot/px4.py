@@ -140,6 +140,7 @@ PX4 = Autopilot(
         port=" (MAV_n_MODE Onboard)",
         battery=" (BAT1_CAPACITY)",
         engaged="PX4 grants OFFBOARD only while setpoints arrive",
+        limits="it circles a subject who stands, and does not keep up with one who walks yet",
     ),
     simulated=Simulated(
         stick_mode="POSCTL",

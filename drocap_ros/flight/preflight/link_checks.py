@@ -77,8 +77,7 @@ _KINDS = {6: "ground station", 18: "companion computer", 26: "gimbal", 27: "ADS-
 @check("others", "who else is heard")
 def _others(measured: Measured) -> Finding:
     names = [f"{_KINDS.get(kind, f'type {kind}')} {at[0]}/{at[1]}" for at, kind in sorted(measured.others.items())]
-    values = {"others": ", ".join(names)}
-    return Finding(graded(), values["others"], "", "", values)
+    return Finding(graded(), ", ".join(names), values={"others": ", ".join(names)})
 
 
 @check("vehicles", "vehicles on the link", _C.SEVERAL_VEHICLES)

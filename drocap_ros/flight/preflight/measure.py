@@ -193,8 +193,7 @@ def version_text(number: int) -> str:
 
 
 def _stream(arrivals: list[int], from_ns: int, now_ns: int, wanted_hz: float) -> Stream:
-    recent = [at for at in arrivals if at >= from_ns]
-    seconds = (now_ns - from_ns) / NS
+    recent, seconds = [at for at in arrivals if at >= from_ns], (now_ns - from_ns) / NS
     if seconds <= 0:
         return Stream(math.nan, wanted_hz)
     gap_s = max(np.diff([from_ns, *recent, now_ns])) / NS

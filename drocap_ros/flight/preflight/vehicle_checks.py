@@ -50,9 +50,9 @@ def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: V
 
 @check("autopilot", "autopilot", _C.AUTOPILOT_UNSUPPORTED)
 def _identity(measured: Measured, vehicle: VehicleState, autopilot: Autopilot) -> Finding:
-    level, found = graded(missing=not autopilot.supported), f"{vehicle.autopilot}, "
+    level, limits = graded(missing=not autopilot.supported), autopilot.hints.limits
     values = {"autopilot": vehicle.autopilot, "version": measured.version}
-    found += measured.version or "version not reported"
+    found = f"{vehicle.autopilot}, {measured.version or 'version not reported'}{limits and f': {limits}'}"
     return Finding(level, found, supported_titles(), "the bridge flies no other autopilot", values)
 
 
@@ -73,11 +73,10 @@ def _loss(config: MavlinkBridgeConfig, measured: Measured, autopilot: Autopilot)
 def _loss_timeout(settings: LossSettings, limit_s: float, too_long: bool) -> Finding:
     found, values = _value(settings.timeout_s, " s"), {"value": settings.timeout_s, "limit": limit_s}
     if not limit_s:
-        return Finding(
-            Level.WARNING, found, "0.5 s", "set max_control_timeout_s to 0.5: 0 switches the check off", values
-        )
+        remedy = "set max_control_timeout_s to 0.5: 0 switches the check off"
+        return Finding(Level.WARNING, found, "0.5 s", remedy, values)
     remedy = (
-        f"set {settings.timeout_name} to {limit_s:g} on the autopilot: for so long it flies on after the bridge's death"
+        f"set {settings.timeout_name} to {limit_s:g} on the autopilot: so long it flies on after the bridge's death"
     )
     return Finding(graded(missing=too_long), found, f"at most {limit_s:g} s", remedy, values)
 
