@@ -205,6 +205,8 @@ class Observed:
     loss_settings : the autopilot's settings for the loss of setpoints
     intruder : another one that commands, or whose keypoints would be followed
     disturbance : a condition that ends motion and that no other field shows
+    operator_age_s : since the last sign of the operator
+    stalled_s : for how long our own loop has just stood still; 0 = it has not, and a long stand is a disturbance too
     refusal : why the autopilot does not enter the requested mode, as a sentence; "" = it does not refuse
     """
 
@@ -220,6 +222,8 @@ class Observed:
     course: Course = Course()
     intruder: Condition | None = None
     disturbance: Condition | None = None
+    operator_age_s: float = math.inf
+    stalled_s: float = 0.0
     refusal: str = ""
 
     @property

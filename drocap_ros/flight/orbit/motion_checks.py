@@ -43,15 +43,23 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
     if not safety.commands_enabled:
         return condition(_C.COMMANDS_DISABLED)
     oldest_s = oldest_state_s(safety, patient=patient)
+    silent = 0.0 < safety.operator_timeout_s < seen.operator_age_s
     return (
         seen.disturbance
+        or (stalled_condition(seen) if seen.stalled_s and not patient else None)
         or _autopilot_condition(seen, limits, oldest_s)
         or _state_condition(seen, safety, oldest_s)
         or _health_condition(seen, safety)
         or battery_condition(seen.health.battery_fraction, seen.health.battery_voltage_v, safety)
         or seen.pictures.camera_problem
         or seen.intruder
+        or (condition(_C.OPERATOR_SILENT, age_s=seen.operator_age_s) if silent else None)
     )
+
+
+def stalled_condition(seen: Observed) -> Condition:
+    """That our own loop stood still."""
+    return condition(_C.CONTROL_LOOP_STALLED, gap_s=seen.stalled_s)
 
 
 def _autopilot_condition(seen: Observed, limits: Limits, oldest_s: float) -> Condition | None:

@@ -27,6 +27,7 @@ from drocap_ros.flight.observed import (
     Subject,
 )
 from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
+from drocap_ros.flight.orbit.motion_checks import stalled_condition
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
@@ -52,6 +53,7 @@ class OwnFlight(NamedTuple):
     unsafe : why the setpoint of the last step was not sent
     intruder : another one that commands or is followed, found in the graph
     refusal : why the autopilot does not enter the requested mode, as a sentence; "" = it does not refuse
+    operator_age_s : since the last sign of the operator
     """
 
     orbiting_s: float = 0.0
@@ -60,6 +62,7 @@ class OwnFlight(NamedTuple):
     unsafe: Condition | None = None
     intruder: Condition | None = None
     refusal: str = ""
+    operator_age_s: float = math.inf
 
 
 class Observer:
@@ -157,11 +160,14 @@ class Observer:
             intruder=own.intruder,
             disturbance=disturbance,
             refusal=own.refusal,
+            operator_age_s=own.operator_age_s,
         )
-        if not observed.jumped and (stood_s := link.decision_age_s()) > config.watchdog_s:
-            # The process stood still within this step: what was read above belongs to different instants.
-            stalled = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
-            observed = dataclasses.replace(observed, disturbance=stalled)
+        # Within this step the process may have stood still too: what was read above belongs to different instants.
+        stood_s = max(dt, link.decision_age_s())
+        if before is not None and (own.hung or stood_s > config.watchdog_s):
+            observed = dataclasses.replace(observed, stalled_s=max(stood_s, config.watchdog_s))
+            if stood_s > max(config.watchdog_s, config.max_state_gap_s) and not observed.jumped:
+                observed = dataclasses.replace(observed, disturbance=stalled_condition(observed))
         return observed, dt
 
     def forget_changed_camera(self) -> None:
@@ -184,8 +190,6 @@ class Observer:
             return condition(ConditionCode.POSITION_JUMPED, jump_m=doubt.jump_m)
         if doubt.error_m_s > 0:
             return condition(ConditionCode.REPORTS_CONTRADICT, error_m_s=doubt.error_m_s)
-        if own.hung or dt > self._config.watchdog_s:
-            return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt)
         return self._camera_changed or own.unsafe
 
 

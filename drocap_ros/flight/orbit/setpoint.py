@@ -264,7 +264,7 @@ def harmless(
     fence_centre : (2,) m; None = there is no fence
     """
     held, velocity = not seen.autopilot.continues_setpoints, complex(*seen.subject.velocity[:2])
-    longest_m, steady_m_s = seen.autopilot.coast.greatest * limits.safety.max_coast_m, coast_speed(seen, limits)
+    longest_m, steady_m_s = seen.autopilot.greatest_coast * limits.safety.max_coast_m, coast_speed(seen, limits)
     fastest_m_s = steady_m_s + _PULLED * (steady_m_s + abs(velocity)) if held else math.inf
     judge = _Coasting(seen, velocity, fence_centre, limits, longest_m, fastest_m_s)
     across_first = seen.subject.position is not None and (held or abs(velocity) > WALKING_M_S)

@@ -105,6 +105,7 @@ def test_with_the_file_that_the_ground_station_loads_nothing_is_missing_and_noth
     found = {code: finding for code, finding in scene.findings.items() if finding.level >= Level.WARNING}
     assert found == {}, found
     assert {name.lower() for name in judged} & scene.findings.keys()
+    assert ("one who walks" in scene.findings["autopilot"].found) == (autopilot == "px4")
     assert scene.findings["fence"].found == "60 m wide, 30 m high"
 
 
