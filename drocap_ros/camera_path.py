@@ -187,6 +187,11 @@ class CameraPath:
         return self.errors is not None and self.up_std_deg < _SURE_UP_DEG
 
     @property
+    def stands_on_points(self) -> bool:
+        """Whether z = 0 is a plane of fixed points, the ground about the person."""
+        return self.teller is Teller.PICTURE and self.picture is not None and self.picture.up is UpSource.GROUND
+
+    @property
     def pose(self) -> tuple[np.ndarray, np.ndarray]:
         """Rotation and position of a camera that has both."""
         assert self.rotation is not None

@@ -20,6 +20,8 @@ from drocap_ros.skeleton import BODY_17, indices
 #: Points of the feet that rest on the ground, ankles first, in ``BODY_17``.
 FEET = np.array(indices(BODY_17.joints, ("rankle", "lankle", "rtoe", "ltoe")))
 ANKLES = FEET[:2]
+#: Height (m) of a resting ankle above the floor.
+ANKLE_M = 0.07
 #: Heights (m) of resting points above that of a resting ankle: toes lie lower.
 FEET_HEIGHT_M = np.array([0.0, 0.0, -0.06, -0.06])
 

@@ -9,7 +9,7 @@ import numpy as np
 from drocap_ros.camera_path import CameraPath, Teller
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.camera.fusion import with_measured
-from drocap_ros.reconstruction.camera.picture_world import at_assumed_stature, seen_from_camera
+from drocap_ros.reconstruction.camera.picture_world import at_assumed_stature, on_ground, seen_from_camera
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses, Progress, packed
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -95,6 +95,8 @@ def in_metres(keypoints: Keypoints2D, poses: ImagePoses, camera: CameraPath, set
     else:
         rotation, frame = camera.rotation, "world"
         seen = poses if camera.matrix is None or not by_place(camera) else aside(poses, camera.matrix)
+        if camera.stands_on_points:
+            per_px = on_ground(camera, seen, per_px)
         placed, refined, refusal = in_world(camera, keypoints, seen, per_px, config_of(camera, config))
         if refusal is not None:
             return refusal

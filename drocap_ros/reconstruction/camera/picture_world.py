@@ -8,6 +8,7 @@ import numpy as np
 
 from drocap_ros.background import Background
 from drocap_ros.camera_path import CameraErrors, CameraPath, Kind, PictureFacts, Teller, UpSource
+from drocap_ros.contacts import ANKLE_M, ANKLES
 from drocap_ros.geometry.rotations import centred_camera, pack_covariance
 from drocap_ros.reconstruction.camera.from_picture import FOCAL_SHARE, camera_from_points
 from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ
@@ -16,8 +17,9 @@ from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.windows import even_slots
 from drocap_ros.reconstruction.world.even_capture import LEAST_FRAMES
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
-from drocap_ros.reconstruction.world.placement import place_in_world
+from drocap_ros.reconstruction.world.placement import place_in_world, smooth_over_time
 from drocap_ros.reconstruction.world.refine import RefinedWorld
+from drocap_ros.reconstruction.world.world_model import GROUND_M, SIZE_STD
 
 #: Errors of a path from fixed points, per track of which a hundred remain: constant ones have no place in it, as the
 #: points turn with the camera; slow ones (`HELD_M`, `_ATTITUDE_DEG`) are at least these.
@@ -27,6 +29,8 @@ HELD_M = 0.02
 #: Least deviation (deg) of an attitude that is told: a person reads it off a tripod, or a phone.
 _TOLD_DEG = 1.0
 _ATTITUDE_DEG = 0.05
+#: Time (s) over which feet that stand and swing are one height.
+_STRIDE_S = 0.5
 #: Largest standard deviation of the logarithm of a path's scale, before body and camera are adjusted together.
 _SCALE_STD = 0.3
 
@@ -120,6 +124,18 @@ def seen_from_camera(camera: CameraPath, poses: ImagePoses, per_px: np.ndarray) 
     frames = len(camera.stamp_ns)
     still = camera.moved(np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)))
     return place_in_world(in_camera_axes(poses, per_px), poses.in_image[..., :2], per_px, still).joints
+
+
+def on_ground(camera: CameraPath, poses: ImagePoses, per_px: np.ndarray) -> np.ndarray:
+    """(F,) metres per px at which the lower foot stands on the ground's points, z = 0, weighed with those by size."""
+    rotation, position = camera.pose
+    lower = (seen_from_camera(camera, poses, per_px) @ rotation)[:, ANKLES, 2].min(axis=1)
+    above = np.maximum(position[:, 2], GROUND_M)
+    fits = (lower < -ANKLE_M) & np.isfinite(lower)
+    off = np.log(np.where(fits, above / np.maximum(ANKLE_M - lower, GROUND_M), 1.0))
+    share = SIZE_STD**2 / (SIZE_STD**2 + np.square(GROUND_M / above))
+    nearer = share * smooth_over_time(off, camera.stamp_ns, _STRIDE_S)
+    return np.asarray(per_px * np.exp(nearer - np.median(nearer)))  # the body keeps its size: metres are the path's
 
 
 def at_assumed_stature(refined: RefinedWorld, stature_std: float) -> RefinedWorld:

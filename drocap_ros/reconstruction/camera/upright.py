@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.camera_path import CameraPath, UpSource
-from drocap_ros.contacts import ANKLES, rest_likelihood
+from drocap_ros.contacts import ANKLE_M, ANKLES, rest_likelihood
 from drocap_ros.reconstruction.world.placement import estimate_scale
+from drocap_ros.reconstruction.world.world_model import SIZE_STD
 from drocap_ros.skeleton import BODY_17
 
 #: Planes through three points that are tried, and distance of a point on one over the camera's height above it.
@@ -68,8 +69,6 @@ _GUESS_STD = 0.7
 FEET_TELL = 0.05
 #: Standard deviation (degrees) of a plane through three points.
 _LEVEL_STD_DEG = 3.0
-#: Least standard deviation of the scale by a body's distance from the camera: the lifter's sizes.
-LEAST_SCALE_STD = 0.04
 #: Standard deviation (degrees) of the body's mean direction from the vertical: people lean, and the lifter does.
 _BODY_STD_DEG = 3.0
 #: Angle (degrees) from the mean at which one frame's direction has half its weight.
@@ -89,8 +88,6 @@ _REST_M = 0.05
 _STEPS = 10
 #: Least standard deviation (degrees) of up: ground is no water level.
 _LEAST_STD_DEG = 0.5
-#: Height (m) of a resting ankle above the floor.
-_ANKLE_M = 0.07
 
 
 class PathScale(NamedTuple):
@@ -153,11 +150,11 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
         source = UpSource.FEET
     plane = by_feet
     if level is not None and source is not UpSource.TOLD:
-        begun = _Plane(level.up, factor * level.height + _ANKLE_M, np.deg2rad(_LEVEL_STD_DEG) ** 2 * np.eye(2))
+        begun = _Plane(level.up, factor * level.height + ANKLE_M, np.deg2rad(_LEVEL_STD_DEG) ** 2 * np.eye(2))
         plane, source = _by_points(begun, feet, lying) or begun, UpSource.GROUND
     turn = _axes(plane.up, rotation[0])
     middle = feet.reshape(-1, 3).mean(axis=0)
-    origin = middle + (plane.height - middle @ plane.up - _ANKLE_M) * plane.up
+    origin = middle + (plane.height - middle @ plane.up - ANKLE_M) * plane.up
     moved = lying.copy()
     moved[:, :3] = (lying[:, :3] - lying[:, 3:] * origin) @ turn.T
     std = max(np.degrees(np.sqrt(0.5 * np.trace(plane.covariance))), _LEAST_STD_DEG)
@@ -169,7 +166,7 @@ def _together(found: list[PathScale]) -> PathScale:
     """Scales as one, by their deviations."""
     weight = np.array([scale.std**-2 for scale in found])
     log = np.log([scale.factor for scale in found])
-    std = max(float(weight.sum() ** -0.5), LEAST_SCALE_STD)
+    std = max(float(weight.sum() ** -0.5), SIZE_STD)
     return PathScale(float(np.exp(weight @ log / weight.sum())), std)
 
 
@@ -208,13 +205,13 @@ def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np
     # The lower foot of a frame stands, mostly; its ankle is a little above the ground.
     down = -(feet @ plane.up)
     above = position @ plane.up - plane.level
-    standing = down.max(axis=1) + _ANKLE_M
+    standing = down.max(axis=1) + ANKLE_M
     fits = (standing > 0.0) & (above > 0.0)
     if fits.mean() < 0.5:
         return None
     log = np.log(standing[fits] / above[fits])
     spread = 1.48 * float(np.median(np.abs(log - np.median(log))))
-    scale = PathScale(float(np.exp(np.median(log))), max(LEAST_SCALE_STD, 0.5 * spread))
+    scale = PathScale(float(np.exp(np.median(log))), max(SIZE_STD, 0.5 * spread))
     return Level(plane.up, plane.level, scale, spread)
 
 
@@ -259,13 +256,13 @@ def _by_points(plane: _Plane, feet: np.ndarray, points: np.ndarray) -> _Plane | 
     places = places[np.linalg.norm(places - middle, axis=1) < _GROUND_M]
     if len(places) < LEAST_ON_PLANE:
         return None
-    floor = plane._replace(height=plane.height - _ANKLE_M)
+    floor = plane._replace(height=plane.height - ANKLE_M)
     found = _fit(floor, places, np.ones(len(places)), _GROUND_STD_M, hold_height=True)
     off = np.abs(places @ found.up - found.height)
     on = int((off < 2 * _GROUND_STD_M).sum())
     if on < max(LEAST_ON_PLANE, LEAST_SHARE * len(places)):
         return None
-    return found._replace(height=found.height + _ANKLE_M)
+    return found._replace(height=found.height + ANKLE_M)
 
 
 def _fit(prior: _Plane, places: np.ndarray, weight: np.ndarray, std_m: float, hold_height: bool = False) -> _Plane:

@@ -32,12 +32,13 @@ from drocap_ros.reconstruction.camera.picture_world import (
     seen_from_camera,
     with_camera,
 )
-from drocap_ros.reconstruction.camera.upright import FEET_TELL, LEAST_SCALE_STD, by_contacts, set_upright
+from drocap_ros.reconstruction.camera.upright import FEET_TELL, by_contacts, set_upright
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.windows import even_slots
 from drocap_ros.reconstruction.live.window import Retry, Window
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.placement import metres_per_px
+from drocap_ros.reconstruction.world.world_model import SIZE_STD
 
 #: Shortest window (s) in which a path begins: a step and some way, and points in most of it.
 _FIRST_S = 3.0
@@ -280,9 +281,9 @@ def _corrected(path: PicturePath, grown: tuple[np.ndarray, np.ndarray, np.ndarra
     (their_turn, their_place), told = fresh.pose, fresh.picture
     assert told is not None
     factor, turn, lift = 1.0, np.eye(3), 0.0
-    if scale is not None and scale.std < FEET_TELL and LEAST_SCALE_STD < abs(np.log(scale.factor)) < _MOST_SCALE:
+    if scale is not None and scale.std < FEET_TELL and SIZE_STD < abs(np.log(scale.factor)) < _MOST_SCALE:
         factor = scale.factor
-        facts = replace(facts, scale_std=max(scale.std, LEAST_SCALE_STD))
+        facts = replace(facts, scale_std=max(scale.std, SIZE_STD))
     up = rotation[-1].T @ their_turn[-1, :, 2]
     tilt = np.arccos(np.clip(up[2], -1.0, 1.0))
     if told.up is UpSource.GROUND and tilt > np.deg2rad(_TILTED_DEG):

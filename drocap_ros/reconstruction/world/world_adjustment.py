@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.contacts import ANKLES, FEET, HEIGHT_STD_M, MOVING, MOVING_LOCKED, RestingFeet, step_height
+from drocap_ros.contacts import ANKLE_M, ANKLES, FEET, HEIGHT_STD_M, MOVING, MOVING_LOCKED, RestingFeet, step_height
 from drocap_ros.reconstruction.common.engine import Covariances, Equations, descend
 from drocap_ros.reconstruction.common.poses import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.world_model import (
@@ -78,6 +78,8 @@ _CONTACT_SPEEDS_M_S = (0.6, 0.4, 0.3, 0.2, 0.15)
 _LEVEL_M = 0.025
 #: and on steps, a third of a stair's riser.
 _STEPS_M = 0.06
+#: Height (m) at which a foot counts a quarter as one on the ground.
+_ABOVE_M = 0.3
 #: Scale below which a step of the adjustment goes astray: no person measures five times the assumed stature.
 _LEAST_SCALE = 0.2
 #: Weight of a held unknown, per m^2 or rad^2: a hundred thousand times that of a clear keypoint.
@@ -121,7 +123,8 @@ def initial_state(data: WorldInput, start: WorldState) -> WorldState:
     """The point to start from, with the lifter's lengths and a floor under the feet."""
     shared = start.globals.copy()
     shared[LENGTHS] = data.lengths
-    shared[FLOOR] = np.percentile(start.joints[:, ANKLES, 2], 10)
+    ankles = start.joints[:, ANKLES, 2]
+    shared[FLOOR] = ANKLE_M if data.config.ground_m else np.percentile(ankles, 10)
     return WorldState(start.joints, start.camera, shared).with_views(len(data.further))
 
 
@@ -177,7 +180,8 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         if stage.finds_floor:
             ground = _ground_spread(state, contact)
             floor_std = _floor_std(ground)
-        here = WorldResiduals(data, weights, state, Contacts(contact, stage.weight, outlier, floor_std))
+        near = _near_ground(state, config.ground_m)
+        here = WorldResiduals(data, weights, state, Contacts(contact, stage.weight, near, outlier, floor_std))
         there = _improved(here, held, stage.locking)
         if there is None:
             stop = NO_DESCENT
@@ -186,7 +190,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         if stage.locking and here.cost - there.cost <= _CONVERGED * here.cost:
             stop = CONVERGED
             break
-    final = WorldResiduals(data, weights, state, Contacts(contact, config.contact_weight, floor_std=floor_std))
+    final = WorldResiduals(data, weights, state, Contacts(contact, config.contact_weight, near, floor_std=floor_std))
     return _solution(final, ground, done, stop)
 
 
@@ -255,8 +259,8 @@ def _with_terms_that_last(final: WorldResiduals) -> WorldResiduals:
     fact, weights = final.data.config.frames_per_fact, final.weights
     views = tuple(v._replace(acceleration=fact * v.acceleration, depth=fact * v.depth) for v in weights.views)
     weights = weights._replace(acceleration=fact * weights.acceleration, views=views)
-    contact, weight, _, floor_std = final.contacts
-    wide = Contacts(contact, fact * weight, floor_std=floor_std / float(np.sqrt(fact)))
+    contact, weight, near, _, floor_std = final.contacts
+    wide = Contacts(contact, fact * weight, fact * near, floor_std=floor_std / float(np.sqrt(fact)))
     return WorldResiduals(final.data, weights, final.state, wide)
 
 
@@ -265,6 +269,18 @@ def _ground_spread(state: WorldState, contact: np.ndarray) -> float:
     height = step_height(state.joints[:, FEET], float(state.globals[FLOOR]))
     total = float(contact.sum())
     return float(np.sqrt((contact * np.square(height)).sum() / total)) if total > 1.0 else float("nan")
+
+
+def _near_ground(state: WorldState, ground_m: float) -> np.ndarray:
+    """(F - 1, 4) 1/m^2, weights of the lower ankle's height above ground that is seen: one who jumps is above it."""
+    height = step_height(state.joints[:, FEET], float(state.globals[FLOOR]))
+    near = np.zeros(height.shape)
+    if not ground_m:
+        return near
+    lower = height[:, : len(ANKLES)].argmin(axis=1)
+    rows = np.arange(len(near))
+    near[rows, lower] = 1.0 / (ground_m * (1.0 + np.square(height[rows, lower] / _ABOVE_M))) ** 2
+    return near
 
 
 def _floor_std(spread: float) -> float:

@@ -17,6 +17,10 @@ from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.skeleton import BODY_15, BODY_17
 
+#: Standard deviation (m) of the lower ankle's height above ground that is seen: steps, unevenness, the lifter's depths.
+GROUND_M = 0.15
+#: Deviation of a body's distance by its size, as a share of it; of the height of his feet, of the camera's above them.
+SIZE_STD = 0.04
 #: Relative standard deviation of the scale below which it counts as measured: half of that among people.
 MEASURED = 0.03
 #: Time (s) after which findings count a third: telemetry drifts, and errors of the poses do not average out.
@@ -107,6 +111,7 @@ class WorldConfig:
     contact_weight, locked_weight : of feet in contact, less than 1 as contacts last for some frames, and of locked ones
     contact_speed_m_s : standard deviation of the speed of a foot in contact
     feet : whether feet in contact keep their place
+    ground_m : standard deviation (m) of the lower ankle from the ground at z = 0, whose points are seen; 0 = none is
     frames_per_fact : frames that carry one independent piece of information: the priors count as much more
     checks : whether telemetry that cannot be true is refused
     """
@@ -122,6 +127,7 @@ class WorldConfig:
     locked_weight: float = 2.0
     contact_speed_m_s: float = 0.1
     feet: bool = True
+    ground_m: float = 0.0
     frames_per_fact: float = 4.0
     checks: bool = True
 
@@ -139,8 +145,21 @@ def config_of(camera: CameraPath, config: WorldConfig) -> WorldConfig:
         stature_std=config.stature_std if camera.scale_std is None else camera.scale_std,
         errors=camera.errors,
         corrected=camera.corrected,
+        ground_m=_ground_m(camera),
         checks=config.checks and camera.of_reports,
     )
+
+
+def _ground_m(camera: CameraPath) -> float:
+    """Standard deviation (m) of a lower ankle from the ground's plane, for a camera so high above it.
+
+    From near the size of the body tells the height of his feet better than a plane that of uneven ground: he may stand
+    on a step.  From high above it errs by more than steps are high.
+    """
+    if not camera.stands_on_points:
+        return 0.0
+    by_size = SIZE_STD * max(float(np.median(camera.pose[1][:, 2])), 1.0)
+    return float(GROUND_M * np.sqrt(1.0 + 2.0 * (GROUND_M / by_size) ** 2))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-from drocap_ros.contacts import FEET, HEIGHT_STD_M, step_height
+from drocap_ros.contacts import ANKLE_M, FEET, HEIGHT_STD_M, step_height
 from drocap_ros.reconstruction.common.engine import (
     Equations,
     add_second_difference,
@@ -78,7 +78,8 @@ def weights_of(data: WorldInput) -> WorldWeights:
     config, size = data.config, GLOBALS + OWN * len(data.further)
     shared, expected = np.zeros((size, size)), np.zeros(size)
     shared[LENGTHS, LENGTHS] = np.diag((config.length_std * data.lengths) ** -2)
-    shared[FLOOR, FLOOR] = _ANY_FLOOR_M**-2
+    shared[FLOOR, FLOOR] = (config.ground_m or _ANY_FLOOR_M) ** -2
+    expected[FLOOR] = ANKLE_M if config.ground_m else 0.0
     shared[SCALE, SCALE] = config.stature_std**-2
     for number, view in enumerate(data.views):
         own = shared_columns(number)[OF_VIEW]
@@ -99,12 +100,14 @@ class Contacts(NamedTuple):
 
     probability : (F - 1, 4) that a point of ``FEET`` keeps its place between two frames
     weight : of that step, 1 = its standard deviation as configured
+    ground : (F - 1, 4) 1/m^2, weight of the height of a lower ankle that stands on the ground, or near it
     outlier : squared image residual, in standard deviations, at which a joint has half its weight
     floor_std : m, spread of the heights of feet in contact
     """
 
     probability: np.ndarray
     weight: float
+    ground: np.ndarray | float = 0.0
     outlier: float = OUTLIER_SQUARE
     floor_std: float = HEIGHT_STD_M
 
@@ -141,7 +144,7 @@ class WorldResiduals:
         touching = self.contacts.probability
         self.step_weight = self.contacts.weight * touching / (config.contact_speed_m_s / self.data.fps) ** 2
         self.height = step_height(feet, self.state.globals[FLOOR])
-        self.height_weight = touching / self.contacts.floor_std**2
+        self.height_weight = touching / self.contacts.floor_std**2 + self.contacts.ground
 
     def _compare_shared(self) -> None:
         """Lengths, scale, misalignments and latencies with their priors."""

@@ -95,6 +95,18 @@ def test_camera_that_stands_still_gives_a_world_at_its_place() -> None:
     assert np.ptp(motion.camera_position, axis=0).max() < 0.1
 
 
+def test_feet_seen_from_high_above_stay_on_the_ground_that_is_seen() -> None:
+    near = orbit(FRAMES, FPS)[1]
+    position = 2.5 * near * [1.0, 1.0, 0.0] + [0.0, 0.0, 14.0]
+    rotation = looking(position, np.zeros((FRAMES, 3)) + [0.0, 0.0, 0.9])
+    motion = reconstruct(tracks(rotation, position))
+    assert motion.meta["camera"]["up"] == "ground"
+    ankles = motion.joints3d[:, [motion.joints.index("rankle"), motion.joints.index("lankle")], 2].min(axis=1)
+    low, high = np.percentile(ankles, [5, 95])
+    assert high - low < 0.15, (low, high)  # by the size of the body alone 0.16
+    assert -0.15 < low < high < 0.3
+
+
 def tripod(action: str, seed: int, telemetry: bool = False, points: bool = True) -> tuple[Tracks, np.ndarray]:
     """Somebody before a camera that stands from 1 to 2.5 m high, and the camera's true rotation (F, 3, 3)."""
     settings = SimulationConfig(action=action, angular_speed_deg_s=0.0, height_m=1.0 + 0.5 * seed)
