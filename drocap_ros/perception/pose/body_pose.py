@@ -162,6 +162,11 @@ class BodyPose(NamedTuple):
         joints = self.extent(least, share)
         return None if joints is None else joints + _MARGIN * (joints[2:] - joints[:2]).max() * np.array([-1, -1, 1, 1])
 
+    def limbs(self) -> np.ndarray:
+        """(14,) px, lengths in the image of what joins the joints of ``BODY_15``."""
+        xy = self.xy[: len(BODY_15)]
+        return np.asarray(np.linalg.norm(xy[1:] - xy[list(BODY_15.parents[1:])], axis=1))
+
     def belief(self, image: np.ndarray, box: np.ndarray) -> float:
         """Confidence that the box (4,) px of this pose shows a person; shadow in the box reduces it."""
         confidence = self.mean_confidence

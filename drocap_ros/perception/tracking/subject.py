@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from enum import Enum
 
 import numpy as np
@@ -11,20 +12,21 @@ from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import (
     FORGET_S,
+    ONE_PERSON,
     Seen,
-    assign_all,
+    assign,
     certainly_others,
-    compare_joints,
-    compare_new,
-    compare_places,
     followed_on,
     found_again,
+    is_someone_else,
 )
 from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, BoxFilter, Person, Subject, boxes_of, person_at
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
 
 _CERTAIN_SCORE = 0.6  # from which the first person ever needs no confirmation by further images
 _GIVEN_IOU = 0.2  # least overlap of a detection with a given box
+_BELIEF = 4.0  # logarithm of the size that full belief in the pose outweighs: a shadow is no smaller than the person
+_LEAST_BELIEF = 0.05  # of a pose, for the weight of its box
 _GIVE_UP_S = 3.0  # for ``on_loss = next``: time beyond coasting after which a subject lost in the image is given up
 
 
@@ -65,14 +67,16 @@ class SubjectChoice:
             persons = certainly_others(last, persons, stamp_ns)
         persons = [p for p in persons if p is not last and p.detected_ns == stamp_ns]
         confirmed = (p for p in persons if self._confirmed(p, first))
-        return min(confirmed, key=lambda p: self._rank(p, shape), default=None)
+        return max(confirmed, key=lambda p: self._rank(p, shape), default=None)
 
     def _rank(self, person: Person, shape: tuple[int, ...]) -> float:
-        """The lowest is chosen: the distance from the image's middle, or the size."""
+        """The highest is chosen: by the size or the distance from the middle, and the belief in the pose."""
+        belief = _BELIEF * (0.0 if np.isnan(person.pose.value) else person.pose.value)
         if self._config.subject == "centre":
-            return float(np.linalg.norm((person.box[:2] + person.box[2:]) / 2 - np.array([shape[1], shape[0]]) / 2))
+            off = (person.box[:2] + person.box[2:]) / 2 - np.array([shape[1], shape[0]]) / 2
+            return belief - float(np.linalg.norm(off)) / person.filter.length
         # After a given box or the drone's the largest person follows.
-        return -float(np.prod(person.box[2:] - person.box[:2]))
+        return belief + float(np.log(np.prod(person.box[2:] - person.box[:2])))
 
     def _waits(self, last: Person | None, stamp_ns: int, coast_s: float, first: bool) -> bool:
         """Whether a box is to come that chooses, or the last subject may come back."""
@@ -86,15 +90,17 @@ class SubjectChoice:
 
     def _confirmed(self, person: Person, first: bool) -> bool:
         """Whether enough images show the person; at the beginning a certain detection is enough."""
-        if person.score < self._config.detection_threshold or not (person.plausible or first):
+        if person.mean_score < self._config.detection_threshold or not (
+            person.plausible or (first and self.nothing_yet)
+        ):
             return False
         return person.hits >= self._config.confirm_frames or (self.nothing_yet and person.score >= _CERTAIN_SCORE)
 
 
 SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same
 _HIDDEN_IOU = 0.25  # overlap with another person from which a predicted box counts as hidden
-_PART = 0.75  # overlap coefficient above which a detection is a part of a tracked person, or that person and more
-_CLUTTER_DOUBLE = 0.3  # overlap coefficient from which what the subject was before is a second box of it
+_SECOND_IOU = 0.35  # overlap above which a detection of its look is a second box of the subject
+_APART = 0.5  # overlap coefficient below which two boxes hold two persons, if each holds one
 _ROI_IOU = 0.1  # overlap with the subject below which a box of the drone's tracker is another choice
 _MOST_CHANGES = 1000  # kept of a run that may last for days
 _BYSTANDER_S = 2.0  # longest gap of a bystander
@@ -108,7 +114,6 @@ class Change(Enum):
 
     CHOSEN = "is followed"
     FOUND_AGAIN = "is found again by place, size and look"
-    EXCHANGED = "is taken to be another detection than before"
     LEFT = "left the picture"
     LOST = "is lost from view"
 
@@ -169,7 +174,7 @@ class SubjectTracker:
         if subject.detected_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)
         box, confirmed = subject.filter.box(), [p for p in self.persons if p.confirmed_ns == stamp_ns]
-        hiding = boxes_of(p for p in confirmed if p is not subject and p.other)
+        hiding = boxes_of(p for p in confirmed if p is not subject and p.plausible)
         return Subject(self._track_id, box, 0.0, bool((iou(box[None], hiding) > _HIDDEN_IOU).any()))
 
     def predict(self, stamp_ns: int) -> Subject | None:
@@ -197,47 +202,56 @@ class SubjectTracker:
             self.subject.filter.update(box, noise=2.0)
             self.subject.confirm(stamp_ns)
 
-    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int) -> None:
-        """Add the mean confidence of the subject's pose, found in a box (4,) px.
+    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int, limbs: np.ndarray | None = None) -> None:
+        """Add the mean confidence of the subject's pose, found in a box (4,) px, and its limbs (J,) px.
 
-        A subject that has shown no person for seconds is lost from its last certain time on.
+        A subject that has shown no person for seconds is lost from its last certain time on; one that never did was
+        none, and the choice is made again.
         """
         subject = self.subject
         if subject is None:
             return
-        subject.pose.judge(confidence, box, stamp_ns)
-        if subject.pose.refuted and subject.pose.box is not None:
-            self.persons.append(subject.remainder(stamp_ns))
-            subject.box, subject.filter = subject.pose.box, BoxFilter(subject.pose.box, subject.certain_ns)
-            subject.detected_ns = subject.confirmed_ns = subject.certain_ns
+        subject.pose.judge(confidence, box, stamp_ns, limbs=limbs)
+        if subject.detected_ns == stamp_ns:
+            subject.filter.doubt(box, max(subject.pose.usual / max(subject.pose.last, _LEAST_BELIEF), 1.0) ** 2)
+        if not subject.pose.refuted:
+            return
+        if subject.pose.box is None:
+            self.subject = None
+            return
+        self.persons.append(subject.remainder(stamp_ns))
+        subject.box, subject.filter = subject.pose.box, BoxFilter(subject.pose.box, subject.certain_ns)
+        subject.detected_ns = subject.confirmed_ns = subject.certain_ns
 
     def judge_bystander(
-        self, person: Person, confidence: float, stamp_ns: int, same: bool = False, blurred: bool = False
+        self,
+        person: Person,
+        confidence: float,
+        stamp_ns: int,
+        same: bool = False,
+        blurred: bool = False,
+        limbs: np.ndarray | None = None,
     ) -> None:
-        """Add a bystander's pose: mean confidence, and whether its joints are the subject's; it may be a lost one."""
+        """Add a bystander's pose: mean confidence, limbs, and whether its joints are the subject's; it may be lost."""
         subject = self.subject
-        person.pose.judge(confidence, person.box, stamp_ns, blurred)
+        person.pose.judge(confidence, person.box, stamp_ns, blurred, limbs)
         if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
-            compare_joints(person, subject, same)
+            apart = overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART
+            if apart:  # of two boxes in each other one may hold the person and its shadow
+                subject.others.add(person)
+            elif same:
+                self.persons.remove(person)
         if self.current(stamp_ns) is None:
             self._reidentify(stamp_ns)
 
-    def exchange(self, image: np.ndarray, stamp_ns: int, box: np.ndarray, score: float) -> Subject:
-        """Continue the subject at a better box (4,) px of this image; a track of what it was before remains."""
-        subject = self.subject
-        assert subject is not None
-        owner = person_at(box, self.persons, stamp_ns, SAME_BOX_IOU)
-        clutter = subject.remainder(stamp_ns)
-        clutter.double = bool(overlap_coefficient(clutter.box[None], box[None].astype(float))[0, 0] > _CLUTTER_DOUBLE)
-        self.persons = [*(p for p in self.persons if p is subject or p is not owner), clutter]
-        if subject.pose.believed_ns is None:  # what it learned was not this person's
-            subject.appearance = describe(image, box)
-        subject.move(box, score, stamp_ns)
-        self._follow(subject, Change.EXCHANGED, self._track_id)
-        return Subject(self._track_id, subject.box, score, False)
-
     def update(
-        self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, roi: np.ndarray | None = None
+        self,
+        image: np.ndarray,
+        stamp_ns: int,
+        boxes: np.ndarray,
+        scores: np.ndarray,
+        roi: np.ndarray | None = None,
+        look: Callable[[], None] | None = None,
     ) -> Subject | None:
         """Update all tracks with one image's detections.
 
@@ -245,6 +259,7 @@ class SubjectTracker:
         stamp_ns : later than the last
         boxes : (N, 4) px; scores : (N,), at least ``low_threshold``
         roi : (4,) px, box of the drone's own tracker, or None
+        look : judges persons of this image by their poses, before one of them is chosen
         """
         if roi is not None:
             self._apply_roi(np.asarray(roi, float), stamp_ns)
@@ -253,14 +268,12 @@ class SubjectTracker:
         self._last_ns = stamp_ns
         for person in self.persons:
             person.filter.predict(stamp_ns)
-        seen = Seen(boxes, scores, [describe(image, box) for box in boxes])
-        subject = self.followed(stamp_ns)
-        others = followed_on(self.subject, self.persons, self._coast_s, stamp_ns)
-        assigned, replacements = assign_all(subject, others, seen, stamp_ns, self._config.detection_threshold)
-        self.persons += replacements
-        compare_places(self.persons, subject, stamp_ns)
+        seen = Seen(boxes.astype(float), scores, [describe(image, box) for box in boxes])
+        assigned = self._assign(seen, stamp_ns)
         self._spawn(seen, assigned, stamp_ns)
         self._reidentify(stamp_ns)
+        if look is not None and self.current(stamp_ns) is None:
+            look()
         self._choose(image.shape, stamp_ns)
         self._prune(image.shape, stamp_ns)
         self.choice.nothing_yet &= not len(boxes)
@@ -271,34 +284,48 @@ class SubjectTracker:
         self._is_shown = shown is not None
         return shown
 
+    def _assign(self, seen: Seen, stamp_ns: int) -> set[int]:
+        """Update everybody with their detections; returns the indices of these."""
+        persons = followed_on(self.subject, self.persons, self._coast_s, stamp_ns)
+        if (subject := self.followed(stamp_ns)) is not None:
+            persons = [subject, *persons]
+        persons = [p for p in persons if p.detected_ns < stamp_ns]
+        pairs, mixed = assign(persons, seen), seen.mixed()
+        for i, j in pairs:
+            person = persons[i]
+            person.update(seen.boxes[j], float(seen.scores[j]), stamp_ns)
+            # A weak detection may be clutter: the pose confirms it.
+            if seen.scores[j] >= self._config.detection_threshold:
+                person.confirm(stamp_ns)
+            if person.pose.believed and not mixed[j]:
+                person.update_appearance(seen.appearances[j])
+        for person in persons:
+            person.searched(person.detected_ns == stamp_ns)
+        return {j for _, j in pairs}
+
     def _follow(self, person: Person, change: Change, track_id: int | None = None) -> None:
         """Make a person the subject, a next one without ``track_id``: the one place at which its track changes."""
         self.subject = person
         if track_id is None:
             track_id = self._last_id = self._last_id + 1
         self._track_id = track_id
-        if change is not Change.EXCHANGED:
-            person.left_image = False
-            self.changes.append((self._last_ns or 0, f"person {track_id} {change.value}"))
+        person.left_image = False
+        self.changes.append((self._last_ns or 0, f"person {track_id} {change.value}"))
 
     def _spawn(self, seen: Seen, assigned: set[int], stamp_ns: int) -> None:
-        """Start tracks from unassigned detections, except parts of tracked persons."""
-        known = self._known_boxes(stamp_ns)
-        for j in np.nonzero(seen.scores >= self._config.detection_threshold)[0].tolist():
-            if j in assigned or (overlap_coefficient(seen.boxes[j][None].astype(float), known) > _PART).any():
-                continue
-            person = Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j])
-            compare_new(person, self.subject, seen.appearances[j])
-            self.persons.append(person)
-
-    def _known_boxes(self, stamp_ns: int) -> np.ndarray:
-        """(N, 4) px of the persons in the image, the predicted subject among them."""
-        subject = self.subject
+        """Start tracks from unassigned detections, except parts of tracked persons and second boxes of the subject."""
         # Leaves and signs that were found to be no person may cover one.
         known = boxes_of(p for p in self.persons if p.detected_ns == stamp_ns and p.plausible)
-        if subject is None or subject.left_image or not 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
-            return known
-        return np.concatenate([known, subject.filter.box()[None]])
+        subject = self.followed(stamp_ns)
+        for j in np.nonzero(seen.scores >= self._config.detection_threshold)[0].tolist():
+            box = seen.boxes[j][None]
+            if j in assigned or (overlap_coefficient(box, known) > ONE_PERSON).any():
+                continue
+            if subject is not None and not is_someone_else(subject, seen.appearances[j]):
+                here = subject.box if subject.detected_ns == stamp_ns else subject.filter.box()
+                if iou(box, here[None])[0, 0] > _SECOND_IOU or overlap_coefficient(box, here[None])[0, 0] > ONE_PERSON:
+                    continue
+            self.persons.append(Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j]))
 
     def _reidentify(self, stamp_ns: int) -> None:
         """Re-identify a lost subject in a new track, the first one before those followed in its absence."""
