@@ -191,7 +191,11 @@ class PoseEstimator:
     ) -> tuple[PoseObservation, bool]:
         """The pose of the detected or predicted subject."""
         pose = self._body.estimate(image, subject.box)
+        subject, pose = self._others.best(image, stamp_ns, subject, pose, shedding)
         self.keypoints, self._score, self._confidence = pose.network, subject.score, pose.mean_confidence
+        if (around := pose.box()) is not None and self.tracker.is_others(around, stamp_ns):
+            self._failures, self._margins = 0, None
+            return self._observation(image, stamp_ns, subject), False
         self.tracker.judge(self._confidence, subject.box, stamp_ns, pose.limbs())
         self._others.judge(image, stamp_ns, pose, self._motion, shedding)
         is_person = self._confidence >= CONFIRM_CONFIDENCE

@@ -118,6 +118,9 @@ class FeetModel:
 
 
 CLEAR_CONFIDENCE = 0.8  # mean confidence of a clear pose; persons in bad light or from steeply above have 0.5 to 0.9
+LEAST_BESIDE = (
+    0.6  # least confidence of a joint in another's box, too: of the own ones 5 % have less, of others' the half
+)
 _SEEN = 0.3  # least confidence of a joint that counts: boxes without a person have a mean below 0.33
 _SAME = 0.05  # median distance of one person's joints in two boxes, share of the body's longer extent
 _MARGIN = 0.06  # of a person's box around the joints, share of their longer extent: head and feet

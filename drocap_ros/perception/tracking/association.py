@@ -60,13 +60,21 @@ def is_someone_else(person: Person, appearance: np.ndarray | None) -> bool:
     return known and person.similarity(appearance) < _OTHER_SIMILARITY
 
 
+def place_cost(person: Person, boxes: np.ndarray, expected: bool = False) -> np.ndarray:
+    """(N,) cost of the places of boxes (N, 4) px as the person's, who is predicted to their image.
+
+    expected : of where the person was expected, before the last update
+    """
+    where = person.filter.expected if expected else person.filter
+    deviation, weight, spread = where.edges(boxes, person.usual_length, person.moves)
+    return np.asarray(0.5 * (_STUDENT + 1) * np.log1p(deviation**2 / _STUDENT) @ weight + np.log(spread))
+
+
 def cost_of(persons: Sequence[Person], seen: Seen) -> np.ndarray:
     """(M, N) of the detections as the persons', who are predicted to their image."""
     cost = np.empty((len(persons), len(seen.boxes)))
     for i, person in enumerate(persons):
-        deviation, weight, spread = person.filter.edges(seen.boxes, person.usual_length, person.moves)
-        edges = 0.5 * (_STUDENT + 1) * np.log1p(deviation**2 / _STUDENT) @ weight
-        cost[i] = edges + np.log(spread) + look_cost(person, seen.appearances) - np.log(seen.scores)
+        cost[i] = place_cost(person, seen.boxes) + look_cost(person, seen.appearances) - np.log(seen.scores)
     return np.asarray(cost + _AGAIN * seen.again())
 
 
@@ -92,7 +100,7 @@ _AWAY_PER_S = np.array([0.4, 0.12])  # and more per second: a run is 1.5 lengths
 _STRANGER = 6.0  # cost of a new track as nobody's who was seen before,
 _ALONE = 9.0  # and where it is certainly a person and no one else may as well be the lost one: the light may change,
 _ALONE_S = 6.0  # within this time
-_MARGIN = 2.5  # by which a cost has to be less than another's to be clearly less
+MARGIN = 1.5  # by which a cost has to be less than another's to be clearly less
 _KNOWN_S = 1.0  # time for which someone new is looked at before the subject is given up for them
 _GONE_S = 0.4  # of a search over the whole image after which someone whom it does not find is out of view
 
@@ -131,11 +139,11 @@ def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_
     if person.hits < (min(2, confirm_frames) if sure else confirm_frames):
         return None
     gone = [p for p in persons if p is not lost and p.plausible and p.undetected_s(stamp_ns) > _GONE_S]
-    if any(look_cost(p, [person.appearance])[0] + _MARGIN < look_cost(lost, [person.appearance])[0] for p in gone):
+    if any(look_cost(p, [person.appearance])[0] + MARGIN < look_cost(lost, [person.appearance])[0] for p in gone):
         return None
     # A second box around the same person is no other one.
     rivals = [p for p in costs if overlap_coefficient(person.box[None], p.box[None])[0, 0] <= ONE_PERSON]
-    alone = all(costs[p] > costs[person] + _MARGIN for p in rivals)
+    alone = all(costs[p] > costs[person] + MARGIN for p in rivals)
     gap = ((person.pose.plausible_ns or 0) - lost.certain_ns) * 1e-9
     return person if alone and costs[person] < (_ALONE if sure and gap < _ALONE_S else _STRANGER) else None
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.perception.pose.body_pose import BodyPose, BodyPoseModel
+from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.tracking.camera_motion import sweeps
-from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, SURE_CONFIDENCE, Person
+from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, SURE_CONFIDENCE, Person, Subject
 from drocap_ros.perception.tracking.subject import SubjectTracker
 
-_MOST = 2  # poses of others per image while there is no subject
+_MOST = 2  # poses of others per image while there is no subject, or of other boxes around it
+_BETTER = 0.1  # confidence by which the pose in another box around the subject has to exceed the one in its own
 _JUDGE_EVERY_NS = 1_000_000_000  # interval of the poses of a bystander beside the subject,
 _SEARCH_EVERY_NS = 300_000_000  # and without one
 
@@ -19,6 +20,23 @@ class OtherPoses:
 
     def __init__(self, tracker: SubjectTracker, model: BodyPoseModel) -> None:
         self._tracker, self._model = tracker, model
+
+    def best(
+        self, image: np.ndarray, stamp_ns: int, subject: Subject, pose: BodyPose, shedding: bool
+    ) -> tuple[Subject, BodyPose]:
+        """Subject and pose, or those of another box around it in whose pose the belief is clearly greater."""
+        known = self._tracker.subject
+        if known is None or subject.score == 0:
+            return subject, pose
+        belief = pose.belief(image, subject.box) * known.pose.fit(pose.limbs(), stamp_ns)
+        if belief >= CLEAR_CONFIDENCE:
+            return subject, pose
+        for box, score in self._tracker.other_boxes(subject)[: 1 if shedding else _MOST]:
+            other = self._model.estimate(image, box)
+            others = other.belief(image, box) * known.pose.fit(other.limbs(), stamp_ns)
+            if others >= max(CONFIRM_CONFIDENCE, belief + _BETTER):
+                subject, pose, belief = self._tracker.correct(subject, box, score), other, others
+        return subject, pose
 
     def judge(
         self, image: np.ndarray, stamp_ns: int, subject: BodyPose | None, motion: np.ndarray | None, shedding: bool

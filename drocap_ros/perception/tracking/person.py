@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -102,8 +103,15 @@ class BoxFilter:
         self.x += gain * innovation[:, None]
         self.p -= gain[:, :, None] * self.p[:, None, 0, :]
 
-    def doubt(self, box: np.ndarray, noise: float) -> None:
-        """Give the last measured box another weight: ``noise`` scales its standard deviation."""
+    @property
+    def expected(self) -> BoxFilter:
+        """The filter before its last update."""
+        before = copy.copy(self)
+        before.x, before.p = self._before
+        return before
+
+    def remeasure(self, box: np.ndarray, noise: float) -> None:
+        """Update with a box in place of the last measured one; ``noise`` as for :meth:`update`."""
         self.x, self.p = self._before
         self.update(box, noise)
 
@@ -175,8 +183,8 @@ class PoseBelief:
             self.judged_ns = stamp_ns
             return
         if limbs is not None:
+            confidence *= self.fit(limbs, stamp_ns)
             limbs = limbs / (self.length or float((box[2:] - box[:2]).max()))
-            confidence *= self._fit(limbs, stamp_ns)
         first = np.isnan(self.value) or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
         self.value = confidence if first else self.value + _RECENT_RATE * (confidence - self.value)
         self.last, self.judged_ns = confidence, stamp_ns
@@ -191,12 +199,12 @@ class PoseBelief:
         if self.value < _IMPLAUSIBLE:
             self.plausible_ns = None
 
-    def _fit(self, limbs: np.ndarray, stamp_ns: int) -> float:
-        """Likelihood of limbs (J,) as the person's, 1 = as they were."""
+    def fit(self, limbs: np.ndarray, stamp_ns: int) -> float:
+        """Likelihood of limbs (J,) px as the person's, 1 = as they were, or unknown."""
         if self._limbs is None or self.believed_ns is None:
             return 1.0
         variance = _LIMBS**2 + _LIMBS_PER_S**2 * (stamp_ns - self.believed_ns) * 1e-9
-        return float(np.exp(-0.5 * ((limbs - self._limbs) ** 2).mean() / variance))
+        return float(np.exp(-0.5 * ((limbs / self.length - self._limbs) ** 2).mean() / variance))
 
     def choose(self, box: np.ndarray, stamp_ns: int) -> None:
         """Believe a box (4,) px that a user or a drone's tracker gave, whatever its pose."""
@@ -315,6 +323,11 @@ class Person:
         reach = max(self.filter.length, self.pose.length) * (0.5 + _SPEED * self.undetected_s(stamp_ns))
         centre = (box[:2] + box[2:]) / 2
         return np.concatenate([np.minimum(box[:2], centre - reach), np.maximum(box[2:], centre + reach)])
+
+    def correct(self, box: np.ndarray, score: float) -> None:
+        """Take another detection of this image in place of the last one."""
+        self.filter.remeasure(box, 1.0)
+        self.box, self.score = np.asarray(box, float), score
 
     def searched(self, found: bool) -> None:
         """Count an image in which it was sought at its place."""

@@ -12,6 +12,7 @@ from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import (
     FORGET_S,
+    MARGIN,
     ONE_PERSON,
     Seen,
     assign,
@@ -19,6 +20,7 @@ from drocap_ros.perception.tracking.association import (
     followed_on,
     found_again,
     is_someone_else,
+    place_cost,
 )
 from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, BoxFilter, Person, Subject, boxes_of, person_at
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
@@ -39,13 +41,15 @@ class SubjectChoice:
         self.box: np.ndarray | None = parse_box(config.subject_box) if config.subject == "box" else None
         #: Whether no image before had a detection.
         self.nothing_yet = True
+        #: Whether poses judge the persons: then whoever has none yet waits.
+        self.by_poses = False
 
-    def given(self, persons: list[Person], stamp_ns: int) -> Person | None:
+    def given(self, image: np.ndarray, persons: list[Person], stamp_ns: int) -> Person | None:
         """The person in the given box, a new one where none is detected; None without a box."""
         if self.box is None:
             return None
         box, self.box = self.box, None
-        return person_at(box, persons, stamp_ns, _GIVEN_IOU) or Person(box, 0.0, stamp_ns, None)
+        return person_at(box, persons, stamp_ns, _GIVEN_IOU) or Person(box, 0.0, stamp_ns, describe(image, box))
 
     def by_rule(
         self,
@@ -94,7 +98,8 @@ class SubjectChoice:
             person.plausible or (first and self.nothing_yet)
         ):
             return False
-        return person.hits >= self._config.confirm_frames or (self.nothing_yet and person.score >= _CERTAIN_SCORE)
+        certain = person.score >= _CERTAIN_SCORE and not person.pose.value < SURE_CONFIDENCE
+        return person.hits >= self._config.confirm_frames or (self.nothing_yet and certain)
 
 
 SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same
@@ -140,6 +145,8 @@ class SubjectTracker:
         self.choice = SubjectChoice(config)
         self._coast_s = config.coast_s
         self._last_ns: int | None = None
+        #: Detections of the last image that are nobody's.
+        self._free = Seen(np.empty((0, 4)), np.empty(0), [])
 
     def reset(self) -> None:
         """Delete all tracks, for stamps that restarted; track ids continue."""
@@ -160,6 +167,10 @@ class SubjectTracker:
     def detected(self, stamp_ns: int) -> list[Person]:
         """Those detected in the image of this time, without the subject."""
         return [p for p in self.persons if p.detected_ns == stamp_ns and p is not self.subject]
+
+    def beside(self, stamp_ns: int) -> list[Person]:
+        """Those of them who certainly were persons."""
+        return [p for p in self.detected(stamp_ns) if p.plausible and p.pose.believed_ns is not None]
 
     @property
     def missed(self) -> bool:
@@ -202,6 +213,30 @@ class SubjectTracker:
             self.subject.filter.update(box, noise=2.0)
             self.subject.confirm(stamp_ns)
 
+    def other_boxes(self, subject: Subject) -> list[tuple[np.ndarray, float]]:
+        """Detections of this image, (4,) px and score, that share most with the subject's and are nobody's.
+
+        They are the person without the shadow or someone else beside it, or the whole person.
+        """
+        shared = overlap_coefficient(self._free.boxes, subject.box[None])[:, 0] > ONE_PERSON
+        same = iou(self._free.boxes, subject.box[None])[:, 0] > SAME_BOX_IOU
+        order = np.argsort(-self._free.scores, kind="stable")
+        return [(self._free.boxes[j], float(self._free.scores[j])) for j in order if shared[j] and not same[j]]
+
+    def is_others(self, box: np.ndarray, stamp_ns: int) -> bool:
+        """Whether a box (4,) px around the joints that were found for the subject is someone else's of this image."""
+        subject = self.subject
+        if subject is None:
+            return False
+        others = [place_cost(p, box[None], expected=True)[0] for p in self.beside(stamp_ns)]
+        return bool(min(others, default=np.inf) + MARGIN < place_cost(subject, box[None], expected=True)[0])
+
+    def correct(self, subject: Subject, box: np.ndarray, score: float) -> Subject:
+        """The subject at another detection (4,) px of the last image."""
+        assert self.subject is not None
+        self.subject.correct(box, score)
+        return Subject(subject.track_id, self.subject.box, score, False)
+
     def judge(self, confidence: float, box: np.ndarray, stamp_ns: int, limbs: np.ndarray | None = None) -> None:
         """Add the mean confidence of the subject's pose, found in a box (4,) px, and its limbs (J,) px.
 
@@ -213,7 +248,9 @@ class SubjectTracker:
             return
         subject.pose.judge(confidence, box, stamp_ns, limbs=limbs)
         if subject.detected_ns == stamp_ns:
-            subject.filter.doubt(box, max(subject.pose.usual / max(subject.pose.last, _LEAST_BELIEF), 1.0) ** 2)
+            if subject.pose.believed:  # whoever certainly was a person, and is in view beside it, is someone else
+                subject.others.update(p for p in self.beside(stamp_ns) if _apart(p, subject))
+            subject.filter.remeasure(box, max(subject.pose.usual / max(subject.pose.last, _LEAST_BELIEF), 1.0) ** 2)
         if not subject.pose.refuted:
             return
         if subject.pose.box is None:
@@ -236,8 +273,7 @@ class SubjectTracker:
         subject = self.subject
         person.pose.judge(confidence, person.box, stamp_ns, blurred, limbs)
         if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
-            apart = overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART
-            if apart:  # of two boxes in each other one may hold the person and its shadow
+            if _apart(person, subject):  # of two boxes in each other one may hold the person and its shadow
                 subject.others.add(person)
             elif same:
                 self.persons.remove(person)
@@ -270,11 +306,14 @@ class SubjectTracker:
             person.filter.predict(stamp_ns)
         seen = Seen(boxes.astype(float), scores, [describe(image, box) for box in boxes])
         assigned = self._assign(seen, stamp_ns)
+        free = [j for j in range(len(boxes)) if j not in assigned]
+        self._free = Seen(seen.boxes[free], scores[free], [seen.appearances[j] for j in free])
         self._spawn(seen, assigned, stamp_ns)
         self._reidentify(stamp_ns)
         if look is not None and self.current(stamp_ns) is None:
+            self.choice.by_poses = True
             look()
-        self._choose(image.shape, stamp_ns)
+        self._choose(image, stamp_ns)
         self._prune(image.shape, stamp_ns)
         self.choice.nothing_yet &= not len(boxes)
         shown = self.current(stamp_ns)
@@ -337,7 +376,9 @@ class SubjectTracker:
         lost = [*self._away, *(() if in_view else [(self._track_id, subject)])]
         free = [p for p in self.persons if p is not subject]
         for track_id, last in lost:
-            if person := found_again(last, free, self._config.confirm_frames, stamp_ns):
+            if person := found_again(
+                last, [*free, *(p for p in last.others if p not in free)], self._config.confirm_frames, stamp_ns
+            ):
                 lost.remove((track_id, last))
                 self._away = lost
                 if not in_view:
@@ -355,9 +396,9 @@ class SubjectTracker:
             subject.update(roi, 0.0, stamp_ns)
             subject.confirm(stamp_ns)
 
-    def _choose(self, shape: tuple[int, ...], stamp_ns: int) -> None:
+    def _choose(self, image: np.ndarray, stamp_ns: int) -> None:
         """Make a person the subject: the one in a given box, then one by the rule."""
-        given = self.choice.given(self.persons, stamp_ns)
+        given = self.choice.given(image, self.persons, stamp_ns)
         if given is not None and given not in self.persons:
             self.persons.append(given)
         if given is not None and given is not self.subject:
@@ -365,7 +406,7 @@ class SubjectTracker:
             self._away = []
             self._follow(given, Change.CHOSEN)
         first = not self._track_id
-        best = self.choice.by_rule(self.persons, self.subject, shape, stamp_ns, self._coast_s, first)
+        best = self.choice.by_rule(self.persons, self.subject, image.shape, stamp_ns, self._coast_s, first)
         if best is None:
             return
         if self.subject is not None:
@@ -378,10 +419,15 @@ class SubjectTracker:
         subject = self.subject
         if subject is not None:
             subject.left_image = subject.undetected_s(stamp_ns) > 0 and (subject.left_image or _leaving(subject, shape))
+            subject.others = {p for p in subject.others if p.undetected_s(stamp_ns) <= FORGET_S}
         kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S]
         if len(kept) > _MAX_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))
         self.persons = kept[:_MAX_PERSONS]
+
+
+def _apart(person: Person, subject: Person) -> bool:
+    return bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
 
 
 def _leaving(person: Person, image_shape: tuple[int, ...]) -> bool:
