@@ -166,8 +166,8 @@ class BodyPose(NamedTuple):
         return None if joints is None else joints + _MARGIN * (joints[2:] - joints[:2]).max() * np.array([-1, -1, 1, 1])
 
     def limbs(self) -> np.ndarray:
-        """(14,) px, lengths in the image of what joins the joints of ``BODY_15``."""
-        xy = self.xy[: len(BODY_15)]
+        """(14,) px, lengths in the image of what joins the joints of ``BODY_15``; NaN where one is not seen."""
+        xy = np.where(self.confidence[:, None] >= _SEEN, self.xy, np.nan)[: len(BODY_15)]
         return np.asarray(np.linalg.norm(xy[1:] - xy[list(BODY_15.parents[1:])], axis=1))
 
     def belief(self, image: np.ndarray, box: np.ndarray) -> float:

@@ -106,16 +106,18 @@ _GONE_S = 0.4  # of a search over the whole image after which someone whom it do
 
 
 def again_cost(lost: Person, person: Person) -> float:
-    """Cost of a new track as a lost person's; infinite for who was in view beside it, or was there before.
+    """Cost of a new track as a lost person's; infinite for who was in view beside it.
 
-    Someone in view may be the lost one if its own track was no person's by then, or theirs was none before.
+    Without poses everybody was who was there before.  With them a track that began on the person may be the person's
+    own, and a shadow's may have become the person's.
     """
     since_ns = person.pose.plausible_ns
-    if since_ns is None or person in lost.others or since_ns <= lost.certain_ns:
+    if since_ns is None or person in lost.others:
         return np.inf
     gap = (since_ns - lost.certain_ns) * 1e-9
-    if gap > FORGET_S:
+    if gap > FORGET_S or (gap <= 0 and person.pose.believed_ns is None):
         return np.inf
+    gap = max(gap, 0.0)
     start = lost.box if lost.pose.box is None else lost.pose.box
     way = np.linalg.norm((start[:2] + start[2:] - person.pose.began[:2] - person.pose.began[2:]) / 2)
     off = np.array([way / lost.usual_length, lost.pose.growth(person.box, lost.usual_length)])

@@ -63,7 +63,11 @@ def due_bystanders(tracker: SubjectTracker, stamp_ns: int, shedding: bool = Fals
     if subject is not None and not searching and subject.pose.believed_ns != stamp_ns:
         return []
     known = subject.others if shedding and subject is not None else ()
-    due = [p for p in tracker.detected(stamp_ns) if p not in known and _due(p, searching, subject is None, stamp_ns)]
+    due = [
+        p
+        for p in tracker.detected(stamp_ns)
+        if p not in known and _due(p, searching or not tracker.apart(p), subject is None, stamp_ns)
+    ]
     return sorted(due, key=lambda p: (p.pose.judged_ns or 0, -p.filter.length))
 
 

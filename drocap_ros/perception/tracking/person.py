@@ -141,10 +141,11 @@ _DROP_S = 2.5  # and after which one without a person is dropped
 _APPEARANCE_RATE = 0.08  # weight of a new descriptor in the mean appearance
 _SETTLED = 10  # descriptors in a settled mean appearance
 #: Deviation of a person's limbs in the image from their recent lengths, shares of the body's: poses of one person have
-#: 0.02 to 0.05, those of two persons or of shadows 0.1 to 0.4;
-_LIMBS = 0.08
+#: 0.02 to 0.05, who runs 0.1, two persons' or shadows' 0.1 to 0.4;
+_LIMBS, _LEAST_LIMBS = 0.08, 5
 _LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn and stoop
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
+_LONG_AGO_NS = 10**18
 #: First, least and largest recent share of detections of a person, and the weight of a new image in it.
 _FIRST_RATE_SEEN, _RATES, _SEEN_RATE = 0.5, (0.2, 0.9), 0.2
 
@@ -170,6 +171,7 @@ class PoseBelief:
         self.length = 0.0
         self.usual = 0.0
         self._limbs: np.ndarray | None = None
+        self._poses = 0
         self._failing_ns: int | None = None
 
     def judge(
@@ -192,7 +194,9 @@ class PoseBelief:
             self.choose(box, stamp_ns)
             self.usual = confidence if not self.usual else self.usual + _SLOW_RATE * (confidence - self.usual)
             if limbs is not None:
-                self._limbs = limbs if self._limbs is None else self._limbs + _RECENT_RATE * (limbs - self._limbs)
+                self._poses += 1
+                known = limbs if self._limbs is None else np.where(np.isnan(self._limbs), limbs, self._limbs)
+                self._limbs = known + max(_RECENT_RATE, 1 / self._poses) * np.nan_to_num(limbs - known)
             return
         if self._failing_ns is None:
             self._failing_ns = stamp_ns
@@ -203,8 +207,12 @@ class PoseBelief:
         """Likelihood of limbs (J,) px as the person's, 1 = as they were, or unknown."""
         if self._limbs is None or self.believed_ns is None:
             return 1.0
-        variance = _LIMBS**2 + _LIMBS_PER_S**2 * (stamp_ns - self.believed_ns) * 1e-9
-        return float(np.exp(-0.5 * ((limbs / self.length - self._limbs) ** 2).mean() / variance))
+        off = (limbs / self.length - self._limbs) ** 2
+        if np.isfinite(off).sum() < _LEAST_LIMBS:
+            return 1.0
+        # Few poses tell little about the usual lengths.
+        variance = _LIMBS**2 * (1 + 1 / self._poses) + _LIMBS_PER_S**2 * (stamp_ns - self.believed_ns) * 1e-9
+        return float(np.exp(-0.5 * np.nanmean(off) / variance))
 
     def choose(self, box: np.ndarray, stamp_ns: int) -> None:
         """Believe a box (4,) px that a user or a drone's tracker gave, whatever its pose."""
@@ -274,6 +282,8 @@ class Person:
     rate : recent share of the searched images that detected it
     left_image : whether it left at an edge of the image; set for the subject only
     others : tracks that were certainly persons in an image of it as the subject, hence not this one
+    met_ns : last time at which its box overlapped the subject's, the subject's that of anybody
+    recent : appearance in the last few images
     pose : what its poses say about it
     """
 
@@ -285,8 +295,9 @@ class Person:
         self.hits = 1
         self.rate, self.left_image = _FIRST_RATE_SEEN, False
         self.others: set[Person] = set()
+        self.met_ns = stamp_ns - _LONG_AGO_NS
         self.pose = PoseBelief(box, stamp_ns)
-        self.appearance = appearance
+        self.appearance = self.recent = appearance
         self._descriptors = 1 if appearance is not None else 0
 
     def undetected_s(self, stamp_ns: int) -> float:
@@ -357,24 +368,23 @@ class Person:
 
     def continue_as(self, lost: Person) -> None:
         """Take over what is known of a lost person who was found again in this track."""
-        self.appearance = lost.appearance if lost.appearance is not None else self.appearance
+        if lost.appearance is not None:
+            self.appearance, self._descriptors = lost.appearance, lost._descriptors
         self.others |= lost.others
 
     def confirm(self, stamp_ns: int) -> None:
         """Confirm the detection at this time."""
         self.detected_ns = self.confirmed_ns = stamp_ns
 
-    def update_appearance(self, appearance: np.ndarray | None) -> None:
-        """Blend a descriptor into the mean appearance, with larger weights at first."""
+    def update_appearance(self, appearance: np.ndarray | None, lasting: bool = True) -> None:
+        """Blend a descriptor into the recent appearance, and the ``lasting`` one, with larger weights at first."""
         if appearance is None:
             return
-        self._descriptors += 1
-        if self.appearance is None:
-            self.appearance = appearance
-            return
-        rate = max(_APPEARANCE_RATE, 1 / self._descriptors) if self._descriptors < _SETTLED else _APPEARANCE_RATE
-        # The squares are the histograms; a blend of these keeps their sum.
-        self.appearance = np.sqrt((1 - rate) * self.appearance**2 + rate * appearance**2)
+        self.recent = _blend(self.recent, appearance, _RECENT_RATE)
+        if lasting or not self.appearance_settled:
+            self._descriptors += 1
+            rate = max(_APPEARANCE_RATE, 1 / self._descriptors) if self._descriptors < _SETTLED else _APPEARANCE_RATE
+            self.appearance = _blend(self.appearance, appearance, rate)
 
     @property
     def appearance_settled(self) -> bool:
@@ -384,6 +394,11 @@ class Person:
     def similarity(self, appearance: np.ndarray | None) -> float:
         """Bhattacharyya coefficient with a descriptor in [0, 1]; 0.5 when one is unknown."""
         return 0.5 if self.appearance is None or appearance is None else float(self.appearance @ appearance)
+
+
+def _blend(mean: np.ndarray | None, appearance: np.ndarray, rate: float) -> np.ndarray:
+    """The squares are the histograms; a blend of these keeps their sum."""
+    return appearance if mean is None else np.asarray(np.sqrt((1 - rate) * mean**2 + rate * appearance**2))
 
 
 def person_at(box: np.ndarray, persons: Iterable[Person], stamp_ns: int, least: float) -> Person | None:

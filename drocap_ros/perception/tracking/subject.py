@@ -20,9 +20,18 @@ from drocap_ros.perception.tracking.association import (
     followed_on,
     found_again,
     is_someone_else,
+    look_cost,
     place_cost,
 )
-from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, BoxFilter, Person, Subject, boxes_of, person_at
+from drocap_ros.perception.tracking.person import (
+    CONFIRM_CONFIDENCE,
+    SURE_CONFIDENCE,
+    BoxFilter,
+    Person,
+    Subject,
+    boxes_of,
+    person_at,
+)
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
 
 _CERTAIN_SCORE = 0.6  # from which the first person ever needs no confirmation by further images
@@ -70,8 +79,10 @@ class SubjectChoice:
         if last is not None and not last.left_image:
             persons = certainly_others(last, persons, stamp_ns)
         persons = [p for p in persons if p is not last and p.detected_ns == stamp_ns]
-        confirmed = (p for p in persons if self._confirmed(p, first))
-        return max(confirmed, key=lambda p: self._rank(p, shape), default=None)
+        # One who is about to be confirmed is waited for.
+        persons = [p for p in persons if self._confirmed(p, first) or (p.plausible and p.hits > 1)]
+        best = max(persons, key=lambda p: self._rank(p, shape), default=None)
+        return best if best is not None and self._confirmed(best, first) else None
 
     def _rank(self, person: Person, shape: tuple[int, ...]) -> float:
         """The highest is chosen: by the size or the distance from the middle, and the belief in the pose."""
@@ -94,9 +105,9 @@ class SubjectChoice:
 
     def _confirmed(self, person: Person, first: bool) -> bool:
         """Whether enough images show the person; at the beginning a certain detection is enough."""
-        if person.mean_score < self._config.detection_threshold or not (
-            person.plausible or (first and self.nothing_yet)
-        ):
+        possible = person.plausible or (first and person.mean_score >= _CERTAIN_SCORE)
+        unjudged = self.by_poses and np.isnan(person.pose.value)
+        if not possible or unjudged or person.mean_score < self._config.detection_threshold:
             return False
         certain = person.score >= _CERTAIN_SCORE and not person.pose.value < SURE_CONFIDENCE
         return person.hits >= self._config.confirm_frames or (self.nothing_yet and certain)
@@ -104,6 +115,9 @@ class SubjectChoice:
 
 SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same
 _HIDDEN_IOU = 0.25  # overlap with another person from which a predicted box counts as hidden
+_MEETS = 0.3  # overlap coefficient from which the subject meets someone,
+_MET_NS = 3_000_000_000  # time after it in which either may be taken for the other,
+_EXCHANGED = 2.5  # and difference of the looks' costs from which they were
 _SECOND_IOU = 0.35  # overlap above which a detection of its look is a second box of the subject
 _APART = 0.5  # overlap coefficient below which two boxes hold two persons, if each holds one
 _ROI_IOU = 0.1  # overlap with the subject below which a box of the drone's tracker is another choice
@@ -118,6 +132,7 @@ class Change(Enum):
     """What happened to the subject: another track than before, or none; the value ends "person N ..."."""
 
     CHOSEN = "is followed"
+    EXCHANGED = "was exchanged with someone beside, by the look, and is put right"
     FOUND_AGAIN = "is found again by place, size and look"
     LEFT = "left the picture"
     LOST = "is lost from view"
@@ -171,6 +186,11 @@ class SubjectTracker:
     def beside(self, stamp_ns: int) -> list[Person]:
         """Those of them who certainly were persons."""
         return [p for p in self.detected(stamp_ns) if p.plausible and p.pose.believed_ns is not None]
+
+    def apart(self, person: Person) -> bool:
+        """Whether the boxes of a person and of the subject hold two persons, if each holds one."""
+        subject = self.subject
+        return subject is None or bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
 
     @property
     def missed(self) -> bool:
@@ -249,8 +269,10 @@ class SubjectTracker:
         subject.pose.judge(confidence, box, stamp_ns, limbs=limbs)
         if subject.detected_ns == stamp_ns:
             if subject.pose.believed:  # whoever certainly was a person, and is in view beside it, is someone else
-                subject.others.update(p for p in self.beside(stamp_ns) if _apart(p, subject))
-            subject.filter.remeasure(box, max(subject.pose.usual / max(subject.pose.last, _LEAST_BELIEF), 1.0) ** 2)
+                subject.others.update(p for p in self.beside(stamp_ns) if self.apart(p))
+            else:
+                belief = max(subject.pose.last, _LEAST_BELIEF) / max(subject.pose.usual, CONFIRM_CONFIDENCE)
+                subject.filter.remeasure(box, noise=min(belief, 1.0) ** -2)
         if not subject.pose.refuted:
             return
         if subject.pose.box is None:
@@ -272,11 +294,13 @@ class SubjectTracker:
         """Add a bystander's pose: mean confidence, limbs, and whether its joints are the subject's; it may be lost."""
         subject = self.subject
         person.pose.judge(confidence, person.box, stamp_ns, blurred, limbs)
-        if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
-            if _apart(person, subject):  # of two boxes in each other one may hold the person and its shadow
+        if subject is not None and subject.pose.believed_ns == stamp_ns:
+            apart = self.apart(person)
+            if apart and confidence >= SURE_CONFIDENCE:
                 subject.others.add(person)
-            elif same:
+            elif same and not apart:  # a box around the subject and something else
                 self.persons.remove(person)
+                subject.others.discard(person)
         if self.current(stamp_ns) is None:
             self._reidentify(stamp_ns)
 
@@ -336,11 +360,32 @@ class SubjectTracker:
             # A weak detection may be clutter: the pose confirms it.
             if seen.scores[j] >= self._config.detection_threshold:
                 person.confirm(stamp_ns)
-            if person.pose.believed and not mixed[j]:
-                person.update_appearance(seen.appearances[j])
+            if person.pose.believed:
+                # Beside the subject either may be taken for the other: what is known of them stays.
+                lasting = not mixed[j] and stamp_ns - person.met_ns > _MET_NS
+                person.update_appearance(seen.appearances[j], lasting)
         for person in persons:
             person.searched(person.detected_ns == stamp_ns)
+        if subject is not None and subject.detected_ns == stamp_ns:
+            self._part(subject, stamp_ns)
         return {j for _, j in pairs}
+
+    def _part(self, subject: Person, stamp_ns: int) -> None:
+        """Note whom the subject meets; after it, who of the two looks like whom tells whether they were exchanged.
+
+        In each image the places count more than the looks; what the looks say adds up over the images.
+        """
+        for person in self.detected(stamp_ns):
+            if overlap_coefficient(person.box[None], subject.box[None])[0, 0] > _MEETS:
+                person.met_ns = subject.met_ns = stamp_ns
+            if not (person.appearance_settled and stamp_ns - person.met_ns <= _MET_NS):
+                continue
+            own, other = (look_cost(p, [subject.recent, person.recent]) for p in (subject, person))
+            if own[0] + other[1] > own[1] + other[0] + _EXCHANGED:
+                subject.appearance, person.appearance = person.appearance, subject.appearance
+                person.others = (subject.others - {person}) | {subject}
+                self._follow(person, Change.EXCHANGED, self._track_id)
+                return
 
     def _follow(self, person: Person, change: Change, track_id: int | None = None) -> None:
         """Make a person the subject, a next one without ``track_id``: the one place at which its track changes."""
@@ -424,10 +469,6 @@ class SubjectTracker:
         if len(kept) > _MAX_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))
         self.persons = kept[:_MAX_PERSONS]
-
-
-def _apart(person: Person, subject: Person) -> bool:
-    return bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
 
 
 def _leaving(person: Person, image_shape: tuple[int, ...]) -> bool:

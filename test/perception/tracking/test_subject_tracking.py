@@ -121,19 +121,6 @@ def test_subject_that_fell_while_unseen_is_in_the_window_of_the_search():
     assert window(24, none) is None
 
 
-def test_detection_near_the_subject_is_not_a_person_from_far_away():
-    # He somersaults; nobody has looked at her for 0.9 s.
-    boxes = np.array([848.0, 214, 1051, 361]), np.array([345.0, 516, 606, 945])
-    subject, other = (Person(box, 0.8, 0, None) for box in boxes)
-    for t in range(1, 52):
-        for person, box in zip((subject, other), boxes, strict=True):
-            person.filter.predict(t * STEP)
-            if person is subject or t < 25:
-                person.update(box, 0.8, t * STEP)
-    found = Seen(np.array([[898.0, 182, 1177, 481]]), np.array([0.54]), [None])
-    assert assign([other], found) == []
-
-
 def test_second_box_of_the_subject_is_no_person_who_hides_it():
     scene = Scene()
     person = (340, 205, 250, RED)
