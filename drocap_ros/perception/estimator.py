@@ -118,7 +118,8 @@ class PoseEstimator:
                 self.tracker.move_camera(self._motion)
             observation, certain = self._observe(image, stamp_ns, roi, load_level)
             self._certain = observation if certain else None
-        self._boxes.append([person.box.copy() for person in self.tracker.persons])
+        persons = (p for p in self.tracker.persons if not p.pose.value < CONFIRM_CONFIDENCE)
+        self._boxes.append([person.box.copy() for person in persons])
         return dataclasses.replace(observation, background=scene.points)
 
     def _scene_of(self, image: np.ndarray, stamp_ns: int, ahead: Frame | None) -> SceneStep:

@@ -24,7 +24,6 @@ from drocap_ros.perception.tracking.association import (
     place_cost,
 )
 from drocap_ros.perception.tracking.person import (
-    CONFIRM_CONFIDENCE,
     SURE_CONFIDENCE,
     BoxFilter,
     Person,
@@ -37,7 +36,8 @@ from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorCo
 _CERTAIN_SCORE = 0.6  # from which the first person ever needs no confirmation by further images
 _GIVEN_IOU = 0.2  # least overlap of a detection with a given box
 _BELIEF = 4.0  # logarithm of the size that full belief in the pose outweighs: a shadow is no smaller than the person
-_LEAST_BELIEF = 0.05  # of a pose, for the weight of its box
+_USUAL = 0.9  # share of the usual belief in a pose below which its box counts less,
+_LEAST_BELIEF = 0.05  # as if it had this one at least
 _GIVE_UP_S = 3.0  # for ``on_loss = next``: time beyond coasting after which a subject lost in the image is given up
 
 
@@ -270,9 +270,9 @@ class SubjectTracker:
         if subject.detected_ns == stamp_ns:
             if subject.pose.believed:  # whoever certainly was a person, and is in view beside it, is someone else
                 subject.others.update(p for p in self.beside(stamp_ns) if self.apart(p))
-            else:
-                belief = max(subject.pose.last, _LEAST_BELIEF) / max(subject.pose.usual, CONFIRM_CONFIDENCE)
-                subject.filter.remeasure(box, noise=min(belief, 1.0) ** -2)
+            doubt = _USUAL * subject.pose.usual / max(subject.pose.last, _LEAST_BELIEF)
+            if doubt > 1.0:
+                subject.filter.remeasure(box, noise=doubt**2)
         if not subject.pose.refuted:
             return
         if subject.pose.box is None:
@@ -378,11 +378,14 @@ class SubjectTracker:
         for person in self.detected(stamp_ns):
             if overlap_coefficient(person.box[None], subject.box[None])[0, 0] > _MEETS:
                 person.met_ns = subject.met_ns = stamp_ns
-            if not (person.appearance_settled and stamp_ns - person.met_ns <= _MET_NS):
+            # Of a track that began at the meeting no look is known but the one it has now.
+            new = stamp_ns - person.first_ns <= _MET_NS
+            met = stamp_ns - max(person.met_ns, subject.met_ns if new else 0) <= _MET_NS
+            if not met or person.hits < self._config.confirm_frames:
                 continue
             own, other = (look_cost(p, [subject.recent, person.recent]) for p in (subject, person))
-            if own[0] + other[1] > own[1] + other[0] + _EXCHANGED:
-                subject.appearance, person.appearance = person.appearance, subject.appearance
+            if own[0] - own[1] + (0.0 if new else other[1] - other[0]) > _EXCHANGED:
+                subject.appearance, person.appearance = subject.recent if new else person.appearance, subject.appearance
                 person.others = (subject.others - {person}) | {subject}
                 self._follow(person, Change.EXCHANGED, self._track_id)
                 return
