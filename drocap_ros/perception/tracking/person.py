@@ -15,7 +15,7 @@ from drocap_ros.perception.tracking.camera_motion import moved_box
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
 _EDGE = 0.06  # standard deviation of an edge of a detection, lengths
 #: That of the acceleration, lengths/s^2 and 1/s^2: a runner turns at about 1 g, 5 lengths/s^2; the camera adds to it.
-_ACCELERATION = np.array([8.0, 8.0, 4.0, 4.0])
+_ACCELERATION = np.array([8.0, 8.0, 2.0, 2.0])
 #: That of the first rate, lengths/s and 1/s: a run.
 _FIRST_RATE = np.array([2.0, 2.0, 0.5, 0.5])
 _CAMERA = 0.5  # deviation of the camera's motion at the person, share: water and crowds that move are followed, too
