@@ -40,7 +40,7 @@ from drocap_ros.recording.video_telemetry import (
     with_attitude,
     with_telemetry,
 )
-from drocap_ros.tracks import Tracks, load_tracks
+from drocap_ros.tracks import Tracks, change_lines, load_tracks
 
 logger = logging.getLogger(__name__)
 
@@ -266,7 +266,7 @@ def _track(
         tracks = tracks_from_observations(observations)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    words = [f"{(t - tracks.stamp_ns[0]) * 1e-9:.1f} s: {text}" for t, text in estimator.tracker.changes][1:]
+    words = change_lines(list(estimator.tracker.changes)[1:], int(tracks.stamp_ns[0]))
     seen = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
     origin: Values = {"pose2d": "estimated", "subject": words, "images": seen | ({"topic": topic} if topic else {})}
     logger.log(logging.WARNING if words else logging.DEBUG, "%s: %s", path, "; ".join(words))

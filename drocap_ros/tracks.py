@@ -319,11 +319,13 @@ def _as_float(array: np.ndarray, name: str) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def save_tracks(path: str | Path, tracks: Tracks) -> None:
-    """Write a tracks ``.npz``."""
+def save_tracks(path: str | Path, tracks: Tracks, changes: Collection[tuple[int, str]] = ()) -> None:
+    """Write a tracks ``.npz``; ``changes`` are stamps (ns) at which the person may be another one, and words."""
     arrays = {name: getattr(tracks, name) for name in _OPTIONAL if getattr(tracks, name) is not None}
     if tracks.background is not None:
         arrays |= tracks.background.arrays()
+    if changes:
+        arrays["change_ns"], arrays["change"] = (np.array(column) for column in zip(*changes, strict=True))
     if tracks.real_lens:
         arrays["lens"] = np.array(_ASSUMED if tracks.camera_matrix is None else _GIVEN)
     np.savez_compressed(
@@ -334,3 +336,8 @@ def save_tracks(path: str | Path, tracks: Tracks) -> None:
         image_size=np.array(tracks.image_size),
         **arrays,
     )
+
+
+def change_lines(changes: Collection[tuple[int, str]], begin_ns: int) -> list[str]:
+    """A line about each change of :func:`save_tracks`, with seconds since the first image."""
+    return [f"{(stamp_ns - begin_ns) * 1e-9:.1f} s: {words}" for stamp_ns, words in changes]

@@ -29,7 +29,7 @@ BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
      "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "live_replay"): 3.85,  # points of the scene, everybody in the pictures
-    ("perception",): 6.62,  # points of the scene; one who is followed live, and everybody in a recording
+    ("perception",): 6.55,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 12.60,  # one engine and one camera; paths by fixed points, several recordings, live windows
     ("flight",): 9.25,  # a process that holds after the bridge's death; preflight; heights by every source
     ("recording",): 5.30,  # every format of telemetry and of keypoints stayed; damaged and foreign recordings

@@ -218,7 +218,7 @@ def _print_metadata(path: Path) -> int:
 def _of_arrays(path: Path) -> Summary:
     from drocap_ros.motion import load_motion
     from drocap_ros.recording.keypoints.files import read_keypoints
-    from drocap_ros.tracks import kind_of, read_npz, wrong_kind
+    from drocap_ros.tracks import change_lines, kind_of, read_npz, wrong_kind
 
     arrays = read_npz(path, ()) if path.suffix == ".npz" else {}
     if "joints3d" in arrays:
@@ -226,7 +226,12 @@ def _of_arrays(path: Path) -> Summary:
     elif kind_of(arrays) == "MoCap":
         raise wrong_kind(path, arrays, "a motion or 2D tracks")
     else:
-        facts = _tracks_facts(read_keypoints(path))
+        facts = _tracks_facts(tracks := read_keypoints(path))
+        if "change" in arrays and "change_ns" in arrays:
+            lines = change_lines(
+                list(zip(arrays["change_ns"], arrays["change"], strict=False)), int(tracks.stamp_ns[0])
+            )
+            facts += [("the person may change", line) for line in lines]
     columns = ("array", "type", "shape") if arrays else ()
     rows = [(name, str(a.dtype), " x ".join(map(str, a.shape)) or "scalar") for name, a in sorted(arrays.items())]
     return Summary([("path", str(path)), *facts], columns, rows)

@@ -131,7 +131,7 @@ def _track(job: _Job) -> str:
     from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
     from drocap_ros.pipeline import follow_selected
     from drocap_ros.report.overlay import OverlayVideo
-    from drocap_ros.tracks import save_tracks
+    from drocap_ros.tracks import change_lines, save_tracks
 
     settings, begin_ns = follow_selected(args.video, config, models, selection, progress)
     estimator = PoseEstimator(models, settings)
@@ -149,12 +149,11 @@ def _track(job: _Job) -> str:
         observations = observe(frames, estimator, on_frame, begin_ns, args.threads)
     tracks_from_observations(observations)  # raises for a recording without a person
     found = subjects(observations)
+    begin, changes = observations[0].stamp_ns, list(estimator.tracker.changes)[1:]
     for rank, (track_id, _) in enumerate(found):
         name = "tracks.npz" if rank == 0 else f"tracks_person_{track_id}.npz"
-        save_tracks(target / name, tracks_from_observations(observations, track_id))
-    begin = observations[0].stamp_ns
-    changes = [f"{(stamp_ns - begin) * 1e-9:.1f} s: {text}" for stamp_ns, text in estimator.tracker.changes]
-    return "\n".join([_summary(found, len(observations)), *changes[1:]])
+        save_tracks(target / name, tracks_from_observations(observations, track_id), changes)
+    return "\n".join([_summary(found, len(observations)), *change_lines(changes, begin)])
 
 
 def _track_people(job: _Job) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.nms import overlap_coefficient
-from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel, FeetModel
+from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, LEAST_BESIDE, BodyPose, BodyPoseModel, FeetModel
 from drocap_ros.perception.tracking.appearance import describe, limb_colours
 from drocap_ros.perception.tracking.association import FORGET_S, found_again
 from drocap_ros.perception.tracking.own_joints import BodyTrack, Poses, own_joints
@@ -20,7 +20,6 @@ from drocap_ros.skeleton import BODY_15, BODY_19
 _HIDDEN_S = 2.0  # time without own joints after which a person is sought elsewhere, too
 _UNDETECTED_S = 3.0  # time without a detection over which doubtful poses are a person's
 _OVERLAP = 0.02  # overlap coefficient of two boxes from which joints may be the other's
-_LEAST_BESIDE = 0.6  # confidence of a joint in another's box, too: of the own ones 5 % have less, of others' the half
 _LEAST_JOINTS = 4  # of BODY_15 that show a person
 _SAME_BODY = 0.1  # median distance of two poses' joints, lengths, below which they are one person's
 
@@ -121,7 +120,7 @@ class Bodies:
         free = np.ones(len(xy), bool)
         for other in others:
             free &= ((xy < other[:2]) | (xy > other[2:])).any(axis=1)
-        least = np.where(free, self._config.keypoint_threshold, _LEAST_BESIDE)
+        least = np.where(free, self._config.keypoint_threshold, LEAST_BESIDE)
         own = (joint >= 0) & inside & (confidence >= least)
         believed = float(np.where(own, confidence, 0.0)[: len(BODY_15)].mean())
         recent = (stamp_ns - track.detected_ns) * 1e-9 <= _UNDETECTED_S

@@ -12,8 +12,6 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.perception.detection.detector import Detections
-from drocap_ros.perception.detection.nms import without_parts
 from drocap_ros.perception.load_models import limited_use, load_detector, load_feet_model, load_pose_model
 from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
@@ -118,10 +116,10 @@ class PoseEstimator:
             self._motion = scene.motion if self.tracker.persons else None
             if self._motion is not None:
                 self.tracker.move_camera(self._motion)
-                self._others.move_camera(self._motion)
             observation, certain = self._observe(image, stamp_ns, roi, load_level)
             self._certain = observation if certain else None
-        self._boxes.append([person.box.copy() for person in self.tracker.persons])
+        persons = (p for p in self.tracker.persons if not p.pose.value < CONFIRM_CONFIDENCE)
+        self._boxes.append([person.box.copy() for person in persons])
         return dataclasses.replace(observation, background=scene.points)
 
     def _scene_of(self, image: np.ndarray, stamp_ns: int, ahead: Frame | None) -> SceneStep:
@@ -163,23 +161,23 @@ class PoseEstimator:
     ) -> tuple[PoseObservation, bool]:
         """The subject by detection, and whether it is certainly a person."""
         shedding = load_level > 0
-        everything = self._search.detect(image, stamp_ns, shedding, close=shedding and self._score >= _CLEAR_SCORE)
-        kept = without_parts(everything.boxes, everything.scores)
-        found = Detections(everything.boxes[kept], everything.scores[kept])
-        subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
+        found = self._search.detect(image, stamp_ns, shedding, close=shedding and self._score >= _CLEAR_SCORE)
+
+        def look() -> None:
+            self._others.judge(image, stamp_ns, None, self._motion, shedding)
+
+        subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi, look)
         if self._ahead is not None and self._searching and not shedding:
             self._search.begin(self._ahead[0].image, self._ahead[0].stamp_ns, self._beside)
         self._searching = True
         if subject is None:
             self._failures = 0
-            self._others.judge_bystander(image, stamp_ns, None, self._motion, shedding=False)
-            subject = self.tracker.current(stamp_ns)
         self._detected_ns, self._score, self._confidence = stamp_ns, 0.0 if subject is None else subject.score, 0.0
         if subject is None:
             return PoseObservation(stamp_ns, 0, _size(image)), False
         if subject.hidden or self._pauses(subject, load_level):
             return self._observation(image, stamp_ns, subject), False
-        return self._estimate_pose(image, stamp_ns, subject, everything, shedding)
+        return self._estimate_pose(image, stamp_ns, subject, shedding)
 
     def _pauses(self, subject: Subject, load_level: int) -> bool:
         """Whether the pose network rests under load shedding, after runs without a person and a clear detection."""
@@ -190,14 +188,17 @@ class PoseEstimator:
         return True
 
     def _estimate_pose(
-        self, image: np.ndarray, stamp_ns: int, subject: Subject, found: Detections, shedding: bool
+        self, image: np.ndarray, stamp_ns: int, subject: Subject, shedding: bool
     ) -> tuple[PoseObservation, bool]:
-        """The pose of the detected or predicted subject, or of a detection that it is instead."""
+        """The pose of the detected or predicted subject."""
         pose = self._body.estimate(image, subject.box)
-        subject, pose = self._others.compete(image, stamp_ns, subject, pose, found, shedding)
+        subject, pose = self._others.best(image, stamp_ns, subject, pose, shedding)
         self.keypoints, self._score, self._confidence = pose.network, subject.score, pose.mean_confidence
-        self.tracker.judge(self._confidence, subject.box, stamp_ns)
-        self._others.judge_bystander(image, stamp_ns, pose, self._motion, shedding)
+        if (around := pose.box()) is not None and self.tracker.is_others(around, stamp_ns):
+            self._failures, self._margins = 0, None
+            return self._observation(image, stamp_ns, subject), False
+        self.tracker.judge(self._confidence, subject.box, stamp_ns, pose.limbs())
+        self._others.judge(image, stamp_ns, pose, self._motion, shedding)
         is_person = self._confidence >= CONFIRM_CONFIDENCE
         self._failures, self._paused = 0 if is_person else self._failures + 1, 0
         detected = subject.score >= self.config.detection_threshold
@@ -253,7 +254,7 @@ class PoseEstimator:
         box = extent + self._margins * (extent[2:] - extent[:2]).max()
         box = np.clip(box, 0, np.tile(np.array(size, float), 2))
         self.tracker.propagate(box, stamp_ns)
-        self.tracker.judge(confidence, box, stamp_ns)
+        self.tracker.judge(confidence, box, stamp_ns, pose.limbs())
         return Subject(subject.track_id, box, subject.score, False)
 
     def _observation(

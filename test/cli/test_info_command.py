@@ -41,9 +41,11 @@ def test_truncated_session_warns_on_stderr(pose_session, capsys):
 
 
 def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, capsys):
-    save_tracks(tmp_path / "tracks.npz", capture.tracks)
+    begin = int(capture.tracks.stamp_ns[0])
+    save_tracks(tmp_path / "tracks.npz", capture.tracks, [(begin + 1_500_000_000, "person 1 is lost from view")])
     assert run(tmp_path / "tracks.npz") == 0
     out = capsys.readouterr().out
+    assert "the person may change: 1.5 s: person 1 is lost from view" in out
     assert "kind: tracks" in out
     assert "frames: 120" in out
     assert "duration: 3.967 s, 30.00 frames/s" in out

@@ -6,10 +6,6 @@ import numpy as np
 
 #: Most boxes that :func:`suppress` keeps: more persons than a tracker follows.
 _MAX_BOXES = 100
-#: A box is a part of a better-scored one when this share of it lies inside.
-_PART_INSIDE = 0.8
-#: And when its area is below this share of the other's: legs or a trunk, of a person seen from the side.
-_PART_AREA = 0.65
 
 
 def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -55,14 +51,3 @@ def suppress(boxes: np.ndarray, scores: np.ndarray, max_iou: float = 0.6) -> np.
                 break
             alive &= overlap[i] <= max_iou
     return order[kept]
-
-
-def without_parts(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Indices of the boxes that are not parts of a better-scored one, such as legs beside the whole person.
-
-    boxes : (N, 4); scores : (N,)
-    """
-    areas = areas_of(boxes)
-    better = scores[None] > scores[:, None]
-    part = better & (overlap_coefficient(boxes, boxes) > _PART_INSIDE) & (areas[:, None] < _PART_AREA * areas[None])
-    return np.nonzero(~part.any(axis=1))[0]

@@ -118,6 +118,9 @@ class FeetModel:
 
 
 CLEAR_CONFIDENCE = 0.8  # mean confidence of a clear pose; persons in bad light or from steeply above have 0.5 to 0.9
+LEAST_BESIDE = (
+    0.6  # least confidence of a joint in another's box, too: of the own ones 5 % have less, of others' the half
+)
 _SEEN = 0.3  # least confidence of a joint that counts: boxes without a person have a mean below 0.33
 _SAME = 0.05  # median distance of one person's joints in two boxes, share of the body's longer extent
 _MARGIN = 0.06  # of a person's box around the joints, share of their longer extent: head and feet
@@ -161,6 +164,11 @@ class BodyPose(NamedTuple):
         """(4,) px box of the person with these joints; None as for :meth:`extent`."""
         joints = self.extent(least, share)
         return None if joints is None else joints + _MARGIN * (joints[2:] - joints[:2]).max() * np.array([-1, -1, 1, 1])
+
+    def limbs(self) -> np.ndarray:
+        """(14,) px, lengths in the image of what joins the joints of ``BODY_15``; NaN where one is not seen."""
+        xy = np.where(self.confidence[:, None] >= _SEEN, self.xy, np.nan)[: len(BODY_15)]
+        return np.asarray(np.linalg.norm(xy[1:] - xy[list(BODY_15.parents[1:])], axis=1))
 
     def belief(self, image: np.ndarray, box: np.ndarray) -> float:
         """Confidence that the box (4,) px of this pose shows a person; shadow in the box reduces it."""

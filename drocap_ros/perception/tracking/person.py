@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -12,10 +13,12 @@ from drocap_ros.perception.tracking.camera_motion import moved_box
 
 #: Standard deviation of a measured box: centre in lengths, logarithm of the sizes.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
+_EDGE = 0.06  # standard deviation of an edge of a detection, lengths
 #: That of the acceleration, lengths/s^2 and 1/s^2: a runner turns at about 1 g, 5 lengths/s^2; the camera adds to it.
-_ACCELERATION = np.array([4.0, 4.0, 2.0, 2.0])
-#: That of the first rate, lengths/s and 1/s: a walk.
-_FIRST_RATE = np.array([1.0, 1.0, 0.5, 0.5])
+_ACCELERATION = np.array([8.0, 8.0, 2.0, 2.0])
+#: That of the first rate, lengths/s and 1/s: a run.
+_FIRST_RATE = np.array([2.0, 2.0, 0.5, 0.5])
+_CAMERA = 0.5  # deviation of the camera's motion at the person, share: water and crowds that move are followed, too
 _DECAY_S = np.array([1.0, 1.0, 0.3, 0.3])  # time in which a rate without measurements falls to a third
 _LONGEST_PREDICTION_S = 0.4  # persons turn, stoop or stop within it
 
@@ -32,6 +35,7 @@ class BoxFilter:
         self.p = np.zeros((4, 2, 2))
         self.p[:, 0, 0] = self._scaled(_MEASURED) ** 2
         self.p[:, 1, 1] = self._scaled(_FIRST_RATE) ** 2
+        self._before = self.x, self.p
 
     def _scaled(self, values: np.ndarray) -> np.ndarray:
         scaled: np.ndarray = values * np.array([self.length, self.length, 1.0, 1.0])
@@ -68,17 +72,48 @@ class BoxFilter:
 
     def move_camera(self, matrix: np.ndarray) -> None:
         """Follow the image's motion (2, 3) by the camera's."""
+        before = self.x[:2, 0].copy()
         self.x[:2] = matrix[:, :2] @ self.x[:2]
         self.x[:2, 0] += matrix[:, 2]
+        self.p[:2, 0, 0] += (_CAMERA * (self.x[:2, 0] - before)) ** 2
         self.x[2:, 0] += 0.5 * np.log(abs(np.linalg.det(matrix[:, :2])))
+
+    def edges(self, boxes: np.ndarray, length: float, moves: bool) -> tuple[np.ndarray, np.ndarray, float]:
+        """Deviations (N, 4) of the edges of boxes (N, 4) px from the predicted ones, and weights (4,) of these.
+
+        Also how much wider the place spreads than a measurement.  Cover takes away one edge at a time, so each counts
+        alone; but an error of the prediction is one of two edges, each of which has half its weight.
+
+        length : px, of the whole person: the box of one who is half hidden is shorter
+        moves : False = what is in the box stays in its place; the spread is that of a measurement
+        """
+        size = np.exp(self.x[2:, 0])
+        measured = (_EDGE * max(length, self.length)) ** 2
+        own = (self.p[:2, 0, 0] + size**2 / 4 * self.p[2:, 0, 0]) * moves
+        variance = measured + own
+        weight = np.tile((measured + own / 2) / variance, 2)
+        return (boxes - self.box()) / np.tile(np.sqrt(variance), 2), weight, float(np.sqrt(variance.prod()) / measured)
 
     def update(self, box: np.ndarray, noise: float = 1.0) -> None:
         """Update with a measured box; ``noise`` scales its standard deviation."""
+        self._before = self.x.copy(), self.p.copy()
         r = (noise * self._scaled(_MEASURED)) ** 2
         innovation = _to_state(box) - self.x[:, 0]
         gain = self.p[:, :, 0] / (self.p[:, 0, 0] + r)[:, None]
         self.x += gain * innovation[:, None]
         self.p -= gain[:, :, None] * self.p[:, None, 0, :]
+
+    @property
+    def expected(self) -> BoxFilter:
+        """The filter before its last update."""
+        before = copy.copy(self)
+        before.x, before.p = self._before
+        return before
+
+    def remeasure(self, box: np.ndarray, noise: float) -> None:
+        """Update with a box in place of the last measured one; ``noise`` as for :meth:`update`."""
+        self.x, self.p = self._before
+        self.update(box, noise)
 
 
 def _to_state(box: np.ndarray) -> np.ndarray:
@@ -105,8 +140,14 @@ _QUESTION_S = 1.0  # time of poses without belief after which a track is questio
 _DROP_S = 2.5  # and after which one without a person is dropped
 _APPEARANCE_RATE = 0.08  # weight of a new descriptor in the mean appearance
 _SETTLED = 10  # descriptors in a settled mean appearance
+#: Deviation of a person's limbs in the image from their recent lengths, shares of the body's: poses of one person have
+#: 0.02 to 0.05, who runs 0.1, two persons' or shadows' 0.1 to 0.4;
+_LIMBS, _LEAST_LIMBS = 0.08, 5
+_LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn and stoop
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
-_RELIABLE_SCORE = 0.4  # least mean score of a reliable track; body parts and clutter score below
+_LONG_AGO_NS = 10**18
+#: First, least and largest recent share of detections of a person, and the weight of a new image in it.
+_FIRST_RATE_SEEN, _RATES, _SEEN_RATE = 0.5, (0.2, 0.9), 0.2
 
 
 class PoseBelief:
@@ -114,6 +155,7 @@ class PoseBelief:
 
     length : px, usual longer side of the believable boxes; partly hidden persons have shorter ones
     value, last : recent mean of the confidence, and that of the last pose; NaN before the first one
+    usual : mean confidence of the believable poses
     judged_ns : last pose; believed_ns, box : last believable one and its box (4,) px, None = none yet
     plausible_ns, began : from when on the track was a person, as far as its poses show, and its box (4,) px then, which
         follows the camera; None = it is none
@@ -127,25 +169,50 @@ class PoseBelief:
         self.plausible_ns: int | None = stamp_ns
         self.began = np.asarray(box, float)
         self.length = 0.0
-        self._usual = 0.0
+        self.usual = 0.0
+        self._limbs: np.ndarray | None = None
+        self._poses = 0
         self._failing_ns: int | None = None
 
-    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int, blurred: bool = False) -> None:
-        """Add a pose by its mean confidence, found in a box (4,) px; a weak one in a blurred image says nothing."""
+    def judge(
+        self, confidence: float, box: np.ndarray, stamp_ns: int, blurred: bool = False, limbs: np.ndarray | None = None
+    ) -> None:
+        """Add a pose by its mean confidence, found in a box (4,) px; a weak one in a blurred image says nothing.
+
+        limbs : (J,) px, lengths in the image; a pose whose limbs are not the person's is another body's, or several'
+        """
         if blurred and confidence < CONFIRM_CONFIDENCE:
             self.judged_ns = stamp_ns
             return
+        if limbs is not None:
+            confidence *= self.fit(limbs, stamp_ns)
+            limbs = limbs / (self.length or float((box[2:] - box[:2]).max()))
         first = np.isnan(self.value) or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
         self.value = confidence if first else self.value + _RECENT_RATE * (confidence - self.value)
         self.last, self.judged_ns = confidence, stamp_ns
-        if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self._usual):
+        if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self.usual):
             self.choose(box, stamp_ns)
-            self._usual = confidence if not self._usual else self._usual + _SLOW_RATE * (confidence - self._usual)
+            self.usual = confidence if not self.usual else self.usual + _SLOW_RATE * (confidence - self.usual)
+            if limbs is not None:
+                self._poses += 1
+                known = limbs if self._limbs is None else np.where(np.isnan(self._limbs), limbs, self._limbs)
+                self._limbs = known + max(_RECENT_RATE, 1 / self._poses) * np.nan_to_num(limbs - known)
             return
         if self._failing_ns is None:
             self._failing_ns = stamp_ns
         if self.value < _IMPLAUSIBLE:
             self.plausible_ns = None
+
+    def fit(self, limbs: np.ndarray, stamp_ns: int) -> float:
+        """Likelihood of limbs (J,) px as the person's, 1 = as they were, or unknown."""
+        if self._limbs is None or self.believed_ns is None:
+            return 1.0
+        off = (limbs / self.length - self._limbs) ** 2
+        if np.isfinite(off).sum() < _LEAST_LIMBS:
+            return 1.0
+        # Few poses tell little about the usual lengths.
+        variance = _LIMBS**2 * (1 + 1 / self._poses) + _LIMBS_PER_S**2 * (stamp_ns - self.believed_ns) * 1e-9
+        return float(np.exp(-0.5 * np.nanmean(off) / variance))
 
     def choose(self, box: np.ndarray, stamp_ns: int) -> None:
         """Believe a box (4,) px that a user or a drone's tracker gave, whatever its pose."""
@@ -212,10 +279,11 @@ class Person:
     first_ns : first detection; detected_ns : last detection; confirmed_ns : last confirmed detection
     score : of the last detection; mean_score : recent mean, low for body parts and clutter
     hits : number of detections
-    began_at_subject, double : whether its first box lay on the subject's, and whether it is a second box around the
-        subject; see ``identity.py``
+    rate : recent share of the searched images that detected it
     left_image : whether it left at an edge of the image; set for the subject only
     others : tracks that were certainly persons in an image of it as the subject, hence not this one
+    met_ns : last time at which its box overlapped the subject's, the subject's that of anybody
+    recent : appearance in the last few images
     pose : what its poses say about it
     """
 
@@ -225,10 +293,11 @@ class Person:
         self.first_ns = self.detected_ns = self.confirmed_ns = stamp_ns
         self.score = self.mean_score = score
         self.hits = 1
-        self.began_at_subject = self.double = self.left_image = False
+        self.rate, self.left_image = _FIRST_RATE_SEEN, False
         self.others: set[Person] = set()
+        self.met_ns = stamp_ns - _LONG_AGO_NS
         self.pose = PoseBelief(box, stamp_ns)
-        self.appearance = appearance
+        self.appearance = self.recent = appearance
         self._descriptors = 1 if appearance is not None else 0
 
     def undetected_s(self, stamp_ns: int) -> float:
@@ -255,14 +324,9 @@ class Person:
         return self.pose.plausible_ns is not None
 
     @property
-    def other(self) -> bool:
-        """Whether its poses leave it to be a person, and it is no second box around the subject."""
-        return self.plausible and not self.double
-
-    @property
-    def reliable(self) -> bool:
-        """Whether the scores and the poses of a bystander let it be compared with the subject."""
-        return self.plausible and self.mean_score >= _RELIABLE_SCORE
+    def moves(self) -> bool:
+        """Whether it was certainly a person once, or may be one: what is none stays in its place."""
+        return self.plausible or self.pose.believed_ns is not None
 
     def sought_box(self, stamp_ns: int) -> np.ndarray:
         """(4,) px around the place where the whole person may be after a gap: the last box showed a part, curled up."""
@@ -270,6 +334,15 @@ class Person:
         reach = max(self.filter.length, self.pose.length) * (0.5 + _SPEED * self.undetected_s(stamp_ns))
         centre = (box[:2] + box[2:]) / 2
         return np.concatenate([np.minimum(box[:2], centre - reach), np.maximum(box[2:], centre + reach)])
+
+    def correct(self, box: np.ndarray, score: float) -> None:
+        """Take another detection of this image in place of the last one."""
+        self.filter.remeasure(box, 1.0)
+        self.box, self.score = np.asarray(box, float), score
+
+    def searched(self, found: bool) -> None:
+        """Count an image in which it was sought at its place."""
+        self.rate = float(np.clip(self.rate + _SEEN_RATE * (found - self.rate), *_RATES))
 
     def update(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
         """Update with a detection, not yet confirmed."""
@@ -279,13 +352,6 @@ class Person:
         self.score = score
         self.mean_score += _RECENT_RATE * (score - self.mean_score)
         self.hits += 1
-
-    def move(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
-        """Continue at another box (4,) px: the last ones were not this person's."""
-        self.filter = BoxFilter(box, stamp_ns)
-        self.box = np.asarray(box, float)
-        self.score = self.mean_score = score
-        self.confirm(stamp_ns)
 
     def remainder(self, stamp_ns: int) -> Person:
         """A track of what its box shows, which was found to be no person."""
@@ -302,24 +368,23 @@ class Person:
 
     def continue_as(self, lost: Person) -> None:
         """Take over what is known of a lost person who was found again in this track."""
-        self.appearance = lost.appearance if lost.appearance is not None else self.appearance
+        if lost.appearance is not None:
+            self.appearance, self._descriptors = lost.appearance, lost._descriptors
         self.others |= lost.others
 
     def confirm(self, stamp_ns: int) -> None:
         """Confirm the detection at this time."""
         self.detected_ns = self.confirmed_ns = stamp_ns
 
-    def update_appearance(self, appearance: np.ndarray | None) -> None:
-        """Blend a descriptor into the mean appearance, with larger weights at first."""
+    def update_appearance(self, appearance: np.ndarray | None, lasting: bool = True) -> None:
+        """Blend a descriptor into the recent appearance, and the ``lasting`` one, with larger weights at first."""
         if appearance is None:
             return
-        self._descriptors += 1
-        if self.appearance is None:
-            self.appearance = appearance
-            return
-        rate = max(_APPEARANCE_RATE, 1 / self._descriptors) if self._descriptors < _SETTLED else _APPEARANCE_RATE
-        # The squares are the histograms; a blend of these keeps their sum.
-        self.appearance = np.sqrt((1 - rate) * self.appearance**2 + rate * appearance**2)
+        self.recent = _blend(self.recent, appearance, _RECENT_RATE)
+        if lasting or not self.appearance_settled:
+            self._descriptors += 1
+            rate = max(_APPEARANCE_RATE, 1 / self._descriptors) if self._descriptors < _SETTLED else _APPEARANCE_RATE
+            self.appearance = _blend(self.appearance, appearance, rate)
 
     @property
     def appearance_settled(self) -> bool:
@@ -329,6 +394,11 @@ class Person:
     def similarity(self, appearance: np.ndarray | None) -> float:
         """Bhattacharyya coefficient with a descriptor in [0, 1]; 0.5 when one is unknown."""
         return 0.5 if self.appearance is None or appearance is None else float(self.appearance @ appearance)
+
+
+def _blend(mean: np.ndarray | None, appearance: np.ndarray, rate: float) -> np.ndarray:
+    """The squares are the histograms; a blend of these keeps their sum."""
+    return appearance if mean is None else np.asarray(np.sqrt((1 - rate) * mean**2 + rate * appearance**2))
 
 
 def person_at(box: np.ndarray, persons: Iterable[Person], stamp_ns: int, least: float) -> Person | None:

@@ -89,7 +89,7 @@ class SubjectSearch:
         if subject is None or self._full_image_due(stamp_ns):
             return False
         around = predicted + _ISOLATED * subject.filter.length * np.array([-1, -1, 1, 1])
-        others = [p.filter.box_at(stamp_ns) for p in self._tracker.persons if p is not subject and p.reliable]
+        others = [p.filter.box_at(stamp_ns) for p in self._tracker.persons if p is not subject and p.plausible]
         edge = _EDGE * max(image_size)
         at_edge = (predicted[:2] < edge).any() or (predicted[2:] > np.array(image_size) - edge).any()
         return not ((overlap_coefficient(around[None], np.array(others).reshape(-1, 4)) > 0).any() or at_edge)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from enum import Enum
 
 import numpy as np
@@ -11,90 +12,35 @@ from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import (
     FORGET_S,
+    MARGIN,
+    ONE_PERSON,
     Seen,
-    assign_all,
-    certainly_others,
-    compare_joints,
-    compare_new,
-    compare_places,
+    assign,
     followed_on,
     found_again,
+    is_someone_else,
+    look_cost,
+    place_cost,
 )
-from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, BoxFilter, Person, Subject, boxes_of, person_at
-from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
+from drocap_ros.perception.tracking.choice import SubjectChoice
+from drocap_ros.perception.tracking.person import (
+    SURE_CONFIDENCE,
+    BoxFilter,
+    Person,
+    Subject,
+    boxes_of,
+)
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
-_CERTAIN_SCORE = 0.6  # from which the first person ever needs no confirmation by further images
-_GIVEN_IOU = 0.2  # least overlap of a detection with a given box
-_GIVE_UP_S = 3.0  # for ``on_loss = next``: time beyond coasting after which a subject lost in the image is given up
-
-
-class SubjectChoice:
-    """Chooses the next subject, of persons tracked in one image."""
-
-    def __init__(self, config: PoseEstimatorConfig) -> None:
-        self._config = config
-        #: (4,) px, given and not yet used.
-        self.box: np.ndarray | None = parse_box(config.subject_box) if config.subject == "box" else None
-        #: Whether no image before had a detection.
-        self.nothing_yet = True
-
-    def given(self, persons: list[Person], stamp_ns: int) -> Person | None:
-        """The person in the given box, a new one where none is detected; None without a box."""
-        if self.box is None:
-            return None
-        box, self.box = self.box, None
-        return person_at(box, persons, stamp_ns, _GIVEN_IOU) or Person(box, 0.0, stamp_ns, None)
-
-    def by_rule(
-        self,
-        persons: list[Person],
-        last: Person | None,
-        shape: tuple[int, ...],
-        stamp_ns: int,
-        coast_s: float,
-        first: bool,
-    ) -> Person | None:
-        """The person detected in this image who becomes the subject; None while there is one to wait for.
-
-        last : the last subject, predicted over ``coast_s``; shape : of the image
-        first : whether there was no subject yet; then a person whose poses are not believable can be chosen
-        """
-        if self._waits(last, stamp_ns, coast_s, first):
-            return None
-        if last is not None and not last.left_image:
-            persons = certainly_others(last, persons, stamp_ns)
-        persons = [p for p in persons if p is not last and p.detected_ns == stamp_ns]
-        confirmed = (p for p in persons if self._confirmed(p, first))
-        return min(confirmed, key=lambda p: self._rank(p, shape), default=None)
-
-    def _rank(self, person: Person, shape: tuple[int, ...]) -> float:
-        """The lowest is chosen: the distance from the image's middle, or the size."""
-        if self._config.subject == "centre":
-            return float(np.linalg.norm((person.box[:2] + person.box[2:]) / 2 - np.array([shape[1], shape[0]]) / 2))
-        # After a given box or the drone's the largest person follows.
-        return -float(np.prod(person.box[2:] - person.box[:2]))
-
-    def _waits(self, last: Person | None, stamp_ns: int, coast_s: float, first: bool) -> bool:
-        """Whether a box is to come that chooses, or the last subject may come back."""
-        waits = self._config.on_loss == "wait"
-        if last is None:
-            return self._config.subject in ("box", "roi") and (first or waits)
-        # Whoever was followed for a moment is not waited for much longer.
-        followed_s = (last.confirmed_ns - last.first_ns) * 1e-9
-        longest_s = 0.0 if last.left_image else coast_s + min(_GIVE_UP_S, followed_s)
-        return waits or last.unconfirmed_s(stamp_ns) <= longest_s
-
-    def _confirmed(self, person: Person, first: bool) -> bool:
-        """Whether enough images show the person; at the beginning a certain detection is enough."""
-        if person.score < self._config.detection_threshold or not (person.plausible or first):
-            return False
-        return person.hits >= self._config.confirm_frames or (self.nothing_yet and person.score >= _CERTAIN_SCORE)
-
-
+_USUAL = 0.9  # share of the usual belief in a pose below which its box counts less,
+_LEAST_BELIEF = 0.05  # as if it had this one at least
 SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same
 _HIDDEN_IOU = 0.25  # overlap with another person from which a predicted box counts as hidden
-_PART = 0.75  # overlap coefficient above which a detection is a part of a tracked person, or that person and more
-_CLUTTER_DOUBLE = 0.3  # overlap coefficient from which what the subject was before is a second box of it
+_MEETS = 0.3  # overlap coefficient from which the subject meets someone,
+_MET_NS = 3_000_000_000  # time after it in which either may be taken for the other,
+_EXCHANGED = 2.5  # and difference of the looks' costs from which they were
+_SECOND_IOU = 0.35  # overlap above which a detection of its look is a second box of the subject
+_APART = 0.5  # overlap coefficient below which two boxes hold two persons, if each holds one
 _ROI_IOU = 0.1  # overlap with the subject below which a box of the drone's tracker is another choice
 _MOST_CHANGES = 1000  # kept of a run that may last for days
 _BYSTANDER_S = 2.0  # longest gap of a bystander
@@ -107,8 +53,8 @@ class Change(Enum):
     """What happened to the subject: another track than before, or none; the value ends "person N ..."."""
 
     CHOSEN = "is followed"
+    EXCHANGED = "was exchanged with someone beside, by the look, and is put right"
     FOUND_AGAIN = "is found again by place, size and look"
-    EXCHANGED = "is taken to be another detection than before"
     LEFT = "left the picture"
     LOST = "is lost from view"
 
@@ -135,6 +81,8 @@ class SubjectTracker:
         self.choice = SubjectChoice(config)
         self._coast_s = config.coast_s
         self._last_ns: int | None = None
+        #: Detections of the last image that are nobody's.
+        self._free = Seen(np.empty((0, 4)), np.empty(0), [])
 
     def reset(self) -> None:
         """Delete all tracks, for stamps that restarted; track ids continue."""
@@ -156,6 +104,15 @@ class SubjectTracker:
         """Those detected in the image of this time, without the subject."""
         return [p for p in self.persons if p.detected_ns == stamp_ns and p is not self.subject]
 
+    def beside(self, stamp_ns: int) -> list[Person]:
+        """Those of them who certainly were persons."""
+        return [p for p in self.detected(stamp_ns) if p.plausible and p.pose.believed_ns is not None]
+
+    def apart(self, person: Person) -> bool:
+        """Whether the boxes of a person and of the subject hold two persons, if each holds one."""
+        subject = self.subject
+        return subject is None or bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
+
     @property
     def missed(self) -> bool:
         """Whether the last image did not show the subject."""
@@ -169,7 +126,7 @@ class SubjectTracker:
         if subject.detected_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)
         box, confirmed = subject.filter.box(), [p for p in self.persons if p.confirmed_ns == stamp_ns]
-        hiding = boxes_of(p for p in confirmed if p is not subject and p.other)
+        hiding = boxes_of(p for p in confirmed if p is not subject and p.plausible)
         return Subject(self._track_id, box, 0.0, bool((iou(box[None], hiding) > _HIDDEN_IOU).any()))
 
     def predict(self, stamp_ns: int) -> Subject | None:
@@ -197,47 +154,85 @@ class SubjectTracker:
             self.subject.filter.update(box, noise=2.0)
             self.subject.confirm(stamp_ns)
 
-    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int) -> None:
-        """Add the mean confidence of the subject's pose, found in a box (4,) px.
+    def other_boxes(self, subject: Subject) -> list[tuple[np.ndarray, float]]:
+        """Detections of this image, (4,) px and score, that share most with the subject's and are nobody's.
 
-        A subject that has shown no person for seconds is lost from its last certain time on.
+        They are the person without the shadow or someone else beside it, or the whole person.
+        """
+        shared = overlap_coefficient(self._free.boxes, subject.box[None])[:, 0] > ONE_PERSON
+        same = iou(self._free.boxes, subject.box[None])[:, 0] > SAME_BOX_IOU
+        order = np.argsort(-self._free.scores, kind="stable")
+        return [(self._free.boxes[j], float(self._free.scores[j])) for j in order if shared[j] and not same[j]]
+
+    def is_others(self, box: np.ndarray, stamp_ns: int) -> bool:
+        """Whether a box (4,) px around the joints that were found for the subject is someone else's of this image."""
+        subject = self.subject
+        if subject is None:
+            return False
+        others = [place_cost(p, box[None], expected=True)[0] for p in self.beside(stamp_ns)]
+        return bool(min(others, default=np.inf) + MARGIN < place_cost(subject, box[None], expected=True)[0])
+
+    def correct(self, subject: Subject, box: np.ndarray, score: float) -> Subject:
+        """The subject at another detection (4,) px of the last image."""
+        assert self.subject is not None
+        self.subject.correct(box, score)
+        return Subject(subject.track_id, self.subject.box, score, False)
+
+    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int, limbs: np.ndarray | None = None) -> None:
+        """Add the mean confidence of the subject's pose, found in a box (4,) px, and its limbs (J,) px.
+
+        A subject that has shown no person for seconds is lost from its last certain time on; one that never did was
+        none, and the choice is made again.
         """
         subject = self.subject
         if subject is None:
             return
-        subject.pose.judge(confidence, box, stamp_ns)
-        if subject.pose.refuted and subject.pose.box is not None:
-            self.persons.append(subject.remainder(stamp_ns))
-            subject.box, subject.filter = subject.pose.box, BoxFilter(subject.pose.box, subject.certain_ns)
-            subject.detected_ns = subject.confirmed_ns = subject.certain_ns
+        subject.pose.judge(confidence, box, stamp_ns, limbs=limbs)
+        if subject.detected_ns == stamp_ns:
+            if subject.pose.believed:  # whoever certainly was a person, and is in view beside it, is someone else
+                subject.others.update(p for p in self.beside(stamp_ns) if self.apart(p))
+            doubt = _USUAL * subject.pose.usual / max(subject.pose.last, _LEAST_BELIEF)
+            if doubt > 1.0:
+                subject.filter.remeasure(box, noise=doubt**2)
+        if not subject.pose.refuted:
+            return
+        if subject.pose.box is None:
+            self.subject = None
+            return
+        self.persons.append(subject.remainder(stamp_ns))
+        subject.box, subject.filter = subject.pose.box, BoxFilter(subject.pose.box, subject.certain_ns)
+        subject.detected_ns = subject.confirmed_ns = subject.certain_ns
 
     def judge_bystander(
-        self, person: Person, confidence: float, stamp_ns: int, same: bool = False, blurred: bool = False
+        self,
+        person: Person,
+        confidence: float,
+        stamp_ns: int,
+        same: bool = False,
+        blurred: bool = False,
+        limbs: np.ndarray | None = None,
     ) -> None:
-        """Add a bystander's pose: mean confidence, and whether its joints are the subject's; it may be a lost one."""
+        """Add a bystander's pose: mean confidence, limbs, and whether its joints are the subject's; it may be lost."""
         subject = self.subject
-        person.pose.judge(confidence, person.box, stamp_ns, blurred)
-        if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
-            compare_joints(person, subject, same)
+        person.pose.judge(confidence, person.box, stamp_ns, blurred, limbs)
+        if subject is not None and subject.pose.believed_ns == stamp_ns:
+            apart = self.apart(person)
+            if apart and confidence >= SURE_CONFIDENCE:
+                subject.others.add(person)
+            elif same and not apart:  # a box around the subject and something else
+                self.persons.remove(person)
+                subject.others.discard(person)
         if self.current(stamp_ns) is None:
             self._reidentify(stamp_ns)
 
-    def exchange(self, image: np.ndarray, stamp_ns: int, box: np.ndarray, score: float) -> Subject:
-        """Continue the subject at a better box (4,) px of this image; a track of what it was before remains."""
-        subject = self.subject
-        assert subject is not None
-        owner = person_at(box, self.persons, stamp_ns, SAME_BOX_IOU)
-        clutter = subject.remainder(stamp_ns)
-        clutter.double = bool(overlap_coefficient(clutter.box[None], box[None].astype(float))[0, 0] > _CLUTTER_DOUBLE)
-        self.persons = [*(p for p in self.persons if p is subject or p is not owner), clutter]
-        if subject.pose.believed_ns is None:  # what it learned was not this person's
-            subject.appearance = describe(image, box)
-        subject.move(box, score, stamp_ns)
-        self._follow(subject, Change.EXCHANGED, self._track_id)
-        return Subject(self._track_id, subject.box, score, False)
-
     def update(
-        self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, roi: np.ndarray | None = None
+        self,
+        image: np.ndarray,
+        stamp_ns: int,
+        boxes: np.ndarray,
+        scores: np.ndarray,
+        roi: np.ndarray | None = None,
+        look: Callable[[], None] | None = None,
     ) -> Subject | None:
         """Update all tracks with one image's detections.
 
@@ -245,6 +240,7 @@ class SubjectTracker:
         stamp_ns : later than the last
         boxes : (N, 4) px; scores : (N,), at least ``low_threshold``
         roi : (4,) px, box of the drone's own tracker, or None
+        look : judges persons of this image by their poses, before one of them is chosen
         """
         if roi is not None:
             self._apply_roi(np.asarray(roi, float), stamp_ns)
@@ -253,15 +249,16 @@ class SubjectTracker:
         self._last_ns = stamp_ns
         for person in self.persons:
             person.filter.predict(stamp_ns)
-        seen = Seen(boxes, scores, [describe(image, box) for box in boxes])
-        subject = self.followed(stamp_ns)
-        others = followed_on(self.subject, self.persons, self._coast_s, stamp_ns)
-        assigned, replacements = assign_all(subject, others, seen, stamp_ns, self._config.detection_threshold)
-        self.persons += replacements
-        compare_places(self.persons, subject, stamp_ns)
+        seen = Seen(boxes.astype(float), scores, [describe(image, box) for box in boxes])
+        assigned = self._assign(seen, stamp_ns)
+        free = [j for j in range(len(boxes)) if j not in assigned]
+        self._free = Seen(seen.boxes[free], scores[free], [seen.appearances[j] for j in free])
         self._spawn(seen, assigned, stamp_ns)
         self._reidentify(stamp_ns)
-        self._choose(image.shape, stamp_ns)
+        if look is not None and self.current(stamp_ns) is None:
+            self.choice.by_poses = True
+            look()
+        self._choose(image, stamp_ns)
         self._prune(image.shape, stamp_ns)
         self.choice.nothing_yet &= not len(boxes)
         shown = self.current(stamp_ns)
@@ -271,34 +268,72 @@ class SubjectTracker:
         self._is_shown = shown is not None
         return shown
 
+    def _assign(self, seen: Seen, stamp_ns: int) -> set[int]:
+        """Update everybody with their detections; returns the indices of these."""
+        persons = followed_on(self.subject, self.persons, self._coast_s, stamp_ns)
+        if (subject := self.followed(stamp_ns)) is not None:
+            persons = [subject, *persons]
+        persons = [p for p in persons if p.detected_ns < stamp_ns]
+        pairs, mixed = assign(persons, seen), seen.mixed()
+        for i, j in pairs:
+            person = persons[i]
+            person.update(seen.boxes[j], float(seen.scores[j]), stamp_ns)
+            # A weak detection may be clutter: the pose confirms it.
+            if seen.scores[j] >= self._config.detection_threshold:
+                person.confirm(stamp_ns)
+            if person.pose.believed:
+                # Beside the subject either may be taken for the other: what is known of them stays.
+                lasting = not mixed[j] and stamp_ns - person.met_ns > _MET_NS
+                person.update_appearance(seen.appearances[j], lasting)
+        for person in persons:
+            person.searched(person.detected_ns == stamp_ns)
+        if subject is not None and subject.detected_ns == stamp_ns:
+            self._part(subject, stamp_ns)
+        return {j for _, j in pairs}
+
+    def _part(self, subject: Person, stamp_ns: int) -> None:
+        """Note whom the subject meets; after it, who of the two looks like whom tells whether they were exchanged.
+
+        In each image the places count more than the looks; what the looks say adds up over the images.
+        """
+        for person in self.detected(stamp_ns):
+            if overlap_coefficient(person.box[None], subject.box[None])[0, 0] > _MEETS:
+                person.met_ns = subject.met_ns = stamp_ns
+            # Of a track that began at the meeting no look is known but the one it has now.
+            new = stamp_ns - person.first_ns <= _MET_NS
+            met = stamp_ns - max(person.met_ns, subject.met_ns if new else 0) <= _MET_NS
+            if not met or person.hits < self._config.confirm_frames:
+                continue
+            own, other = (look_cost(p, [subject.recent, person.recent]) for p in (subject, person))
+            if own[0] - own[1] + (0.0 if new else other[1] - other[0]) > _EXCHANGED:
+                subject.appearance, person.appearance = subject.recent if new else person.appearance, subject.appearance
+                person.others = (subject.others - {person}) | {subject}
+                self._follow(person, Change.EXCHANGED, self._track_id)
+                return
+
     def _follow(self, person: Person, change: Change, track_id: int | None = None) -> None:
         """Make a person the subject, a next one without ``track_id``: the one place at which its track changes."""
         self.subject = person
         if track_id is None:
             track_id = self._last_id = self._last_id + 1
         self._track_id = track_id
-        if change is not Change.EXCHANGED:
-            person.left_image = False
-            self.changes.append((self._last_ns or 0, f"person {track_id} {change.value}"))
+        person.left_image = False
+        self.changes.append((self._last_ns or 0, f"person {track_id} {change.value}"))
 
     def _spawn(self, seen: Seen, assigned: set[int], stamp_ns: int) -> None:
-        """Start tracks from unassigned detections, except parts of tracked persons."""
-        known = self._known_boxes(stamp_ns)
-        for j in np.nonzero(seen.scores >= self._config.detection_threshold)[0].tolist():
-            if j in assigned or (overlap_coefficient(seen.boxes[j][None].astype(float), known) > _PART).any():
-                continue
-            person = Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j])
-            compare_new(person, self.subject, seen.appearances[j])
-            self.persons.append(person)
-
-    def _known_boxes(self, stamp_ns: int) -> np.ndarray:
-        """(N, 4) px of the persons in the image, the predicted subject among them."""
-        subject = self.subject
+        """Start tracks from unassigned detections, except parts of tracked persons and second boxes of the subject."""
         # Leaves and signs that were found to be no person may cover one.
         known = boxes_of(p for p in self.persons if p.detected_ns == stamp_ns and p.plausible)
-        if subject is None or subject.left_image or not 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
-            return known
-        return np.concatenate([known, subject.filter.box()[None]])
+        subject = self.followed(stamp_ns)
+        for j in np.nonzero(seen.scores >= self._config.detection_threshold)[0].tolist():
+            box = seen.boxes[j][None]
+            if j in assigned or (overlap_coefficient(box, known) > ONE_PERSON).any():
+                continue
+            if subject is not None and not is_someone_else(subject, seen.appearances[j]):
+                here = subject.box if subject.detected_ns == stamp_ns else subject.filter.box()
+                if iou(box, here[None])[0, 0] > _SECOND_IOU or overlap_coefficient(box, here[None])[0, 0] > ONE_PERSON:
+                    continue
+            self.persons.append(Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j]))
 
     def _reidentify(self, stamp_ns: int) -> None:
         """Re-identify a lost subject in a new track, the first one before those followed in its absence."""
@@ -310,7 +345,9 @@ class SubjectTracker:
         lost = [*self._away, *(() if in_view else [(self._track_id, subject)])]
         free = [p for p in self.persons if p is not subject]
         for track_id, last in lost:
-            if person := found_again(last, free, self._config.confirm_frames, stamp_ns):
+            if person := found_again(
+                last, [*free, *(p for p in last.others if p not in free)], self._config.confirm_frames, stamp_ns
+            ):
                 lost.remove((track_id, last))
                 self._away = lost
                 if not in_view:
@@ -328,9 +365,9 @@ class SubjectTracker:
             subject.update(roi, 0.0, stamp_ns)
             subject.confirm(stamp_ns)
 
-    def _choose(self, shape: tuple[int, ...], stamp_ns: int) -> None:
+    def _choose(self, image: np.ndarray, stamp_ns: int) -> None:
         """Make a person the subject: the one in a given box, then one by the rule."""
-        given = self.choice.given(self.persons, stamp_ns)
+        given = self.choice.given(image, self.persons, stamp_ns)
         if given is not None and given not in self.persons:
             self.persons.append(given)
         if given is not None and given is not self.subject:
@@ -338,7 +375,7 @@ class SubjectTracker:
             self._away = []
             self._follow(given, Change.CHOSEN)
         first = not self._track_id
-        best = self.choice.by_rule(self.persons, self.subject, shape, stamp_ns, self._coast_s, first)
+        best = self.choice.by_rule(self.persons, self.subject, image.shape, stamp_ns, self._coast_s, first)
         if best is None:
             return
         if self.subject is not None:
@@ -351,6 +388,7 @@ class SubjectTracker:
         subject = self.subject
         if subject is not None:
             subject.left_image = subject.undetected_s(stamp_ns) > 0 and (subject.left_image or _leaving(subject, shape))
+            subject.others = {p for p in subject.others if p.undetected_s(stamp_ns) <= FORGET_S}
         kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S]
         if len(kept) > _MAX_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))

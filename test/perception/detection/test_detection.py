@@ -8,7 +8,7 @@ from tiny_models import write_model
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.perception.detection.nms import iou, overlap_coefficient, suppress, without_parts
+from drocap_ros.perception.detection.nms import iou, suppress
 from drocap_ros.perception.load_models import load_detector
 from drocap_ros.perception.models.network_input import letterbox
 from drocap_ros.perception.models.spec import grid_centres
@@ -166,10 +166,3 @@ def test_suppression_keeps_the_best_of_each_overlap(count, threshold, seed):
     dropped = np.setdiff1d(np.arange(count), kept)
     for i in dropped:  # a better box overlaps each one dropped
         assert (iou(boxes[i][None], boxes[kept])[0][scores[kept] >= scores[i]] > threshold).any()
-
-
-def test_parts_of_a_better_box_are_dropped():
-    boxes = np.array([[0, 0, 40, 100], [2, 55, 38, 99], [30, 0, 70, 100]], float)
-    assert without_parts(boxes, np.array([0.9, 0.5, 0.4])).tolist() == [0, 2]
-    assert without_parts(boxes, np.array([0.4, 0.5, 0.4])).tolist() == [0, 1, 2]
-    assert overlap_coefficient(boxes[:1], boxes[1:2])[0, 0] == pytest.approx(1.0)

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.perception.background_tracks import BackgroundTracks
-from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box, sweeps
-from drocap_ros.perception.tracking.other_poses import due_bystander, possible_subjects
 from drocap_ros.perception.tracking.person import BoxFilter
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.subject import SubjectTracker
@@ -145,22 +143,6 @@ def test_a_shaken_camera_keeps_its_subject_by_the_known_motion_alone(known):
         subject = tracker.update(image, i * STEP_NS, np.array([[x - 25, 100, x + 25, 240]]), np.array([0.8]))
         followed.append(subject is not None and subject.score > 0 and abs(subject.box[[0, 2]].mean() - x) < 5)
     assert all(followed) == known
-
-
-def test_a_second_box_around_a_known_other_person_is_not_the_subject():
-    tracker = SubjectTracker(PoseEstimatorConfig())
-    image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
-    boxes = np.array([[280.0, 100, 340, 260], [370.0, 100, 430, 260]])
-    for i in range(20):
-        stamp = i * STEP_NS
-        subject = tracker.update(image, stamp, boxes, np.array([0.9, 0.8]))
-        tracker.judge(0.9, subject.box, stamp)
-        if (other := due_bystander(tracker, stamp)) is not None:
-            tracker.judge_bystander(other, 0.9, stamp)
-    wider = np.array([[355.0, 60, 490, 290]])
-    score = np.array([0.3])
-    assert possible_subjects(tracker, image, Detections(wider, score), 0.3, stamp) == []
-    assert possible_subjects(tracker, image, Detections(wider - [200, 0, 200, 0], score), 0.3, stamp) == [0]
 
 
 @pytest.mark.parametrize(("way", "blurred"), [((0.0, 0.0), False), ((30.0, 15.0), False), ((30.0, -30.0), True)])

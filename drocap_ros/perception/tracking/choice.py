@@ -1,0 +1,87 @@
+"""The choice of the next subject: by a given box, or by a rule among those in view."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.perception.tracking.appearance import describe
+from drocap_ros.perception.tracking.association import certainly_others
+from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person, person_at
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
+
+_CERTAIN_SCORE = 0.6  # from which the first person ever needs no confirmation by further images
+_GIVEN_IOU = 0.2  # least overlap of a detection with a given box
+_BELIEF = 4.0  # logarithm of the size that full belief in the pose outweighs: a shadow is no smaller than the person
+_GIVE_UP_S = 3.0  # for ``on_loss = next``: time beyond coasting after which a subject lost in the image is given up
+
+
+class SubjectChoice:
+    """Chooses the next subject, of persons tracked in one image."""
+
+    def __init__(self, config: PoseEstimatorConfig) -> None:
+        self._config = config
+        #: (4,) px, given and not yet used.
+        self.box: np.ndarray | None = parse_box(config.subject_box) if config.subject == "box" else None
+        #: Whether no image before had a detection.
+        self.nothing_yet = True
+        #: Whether poses judge the persons: then whoever has none yet waits.
+        self.by_poses = False
+
+    def given(self, image: np.ndarray, persons: list[Person], stamp_ns: int) -> Person | None:
+        """The person in the given box, a new one where none is detected; None without a box."""
+        if self.box is None:
+            return None
+        box, self.box = self.box, None
+        return person_at(box, persons, stamp_ns, _GIVEN_IOU) or Person(box, 0.0, stamp_ns, describe(image, box))
+
+    def by_rule(
+        self,
+        persons: list[Person],
+        last: Person | None,
+        shape: tuple[int, ...],
+        stamp_ns: int,
+        coast_s: float,
+        first: bool,
+    ) -> Person | None:
+        """The person detected in this image who becomes the subject; None while there is one to wait for.
+
+        last : the last subject, predicted over ``coast_s``; shape : of the image
+        first : whether there was no subject yet; then a person whose poses are not believable can be chosen
+        """
+        if self._waits(last, stamp_ns, coast_s, first):
+            return None
+        if last is not None and not last.left_image:
+            persons = certainly_others(last, persons, stamp_ns)
+        persons = [p for p in persons if p is not last and p.detected_ns == stamp_ns]
+        # One who is about to be confirmed is waited for.
+        persons = [p for p in persons if self._confirmed(p, first) or (p.plausible and p.hits > 1)]
+        best = max(persons, key=lambda p: self._rank(p, shape), default=None)
+        return best if best is not None and self._confirmed(best, first) else None
+
+    def _rank(self, person: Person, shape: tuple[int, ...]) -> float:
+        """The highest is chosen: by the size or the distance from the middle, and the belief in the pose."""
+        belief = _BELIEF * (0.0 if np.isnan(person.pose.value) else person.pose.value)
+        if self._config.subject == "centre":
+            off = (person.box[:2] + person.box[2:]) / 2 - np.array([shape[1], shape[0]]) / 2
+            return belief - float(np.linalg.norm(off)) / person.filter.length
+        # After a given box or the drone's the largest person follows.
+        return belief + float(np.log(np.prod(person.box[2:] - person.box[:2])))
+
+    def _waits(self, last: Person | None, stamp_ns: int, coast_s: float, first: bool) -> bool:
+        """Whether a box is to come that chooses, or the last subject may come back."""
+        waits = self._config.on_loss == "wait"
+        if last is None:
+            return self._config.subject in ("box", "roi") and (first or waits)
+        # Whoever was followed for a moment is not waited for much longer.
+        followed_s = (last.confirmed_ns - last.first_ns) * 1e-9
+        longest_s = 0.0 if last.left_image else coast_s + min(_GIVE_UP_S, followed_s)
+        return waits or last.unconfirmed_s(stamp_ns) <= longest_s
+
+    def _confirmed(self, person: Person, first: bool) -> bool:
+        """Whether enough images show the person; at the beginning a certain detection is enough."""
+        possible = person.plausible or (first and person.mean_score >= _CERTAIN_SCORE)
+        unjudged = self.by_poses and np.isnan(person.pose.value)
+        if not possible or unjudged or person.mean_score < self._config.detection_threshold:
+            return False
+        certain = person.score >= _CERTAIN_SCORE and not person.pose.value < SURE_CONFIDENCE
+        return person.hits >= self._config.confirm_frames or (self.nothing_yet and certain)
