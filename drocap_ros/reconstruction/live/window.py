@@ -31,6 +31,8 @@ class Window(NamedTuple):
     assumed_focal_px : of the lens where the camera is unknown; None = distant
     background : fixed points of the scene in its images; None = there are none
     image_size : width and height px
+    track_id : of the subject
+    known_ns : stamps of the newest state of the vehicle and fixed points that were known, 0 = none
     """
 
     stamp_ns: np.ndarray
@@ -41,6 +43,8 @@ class Window(NamedTuple):
     assumed_focal_px: float | None = None
     background: Background | None = None
     image_size: tuple[int, int] = (0, 0)
+    track_id: int = 0
+    known_ns: tuple[int, int] = (0, 0)
 
     @property
     def height_m(self) -> float:

@@ -10,7 +10,7 @@ from live_stream import observed
 from walking import stamps
 
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin, StreamEvent
+from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StreamEvent
 
 ADJUSTER = BundleAdjusterConfig(period_s=0.5, window_s=2.0)
 JOINTS = np.zeros((15, 3))
@@ -63,16 +63,3 @@ def test_memory_is_bounded_at_any_frame_rate() -> None:
     for i, o in enumerate(observed(60) * 2):
         buffer.push(replace(o, stamp_ns=i * 10**6), JOINTS)
     assert len(buffer.window().stamp_ns) == 50
-
-
-def test_parts_are_joined_in_any_order_and_old_ones_are_dropped() -> None:
-    join: StampJoin[str, int] = StampJoin(2)
-    assert join.add_first(1, "a") is None
-    assert join.add_second(1, 10) == ("a", 10)
-    assert join.add_second(2, 20) is None
-    assert join.add_first(2, "b") == ("b", 20)
-    for stamp in (3, 4, 5):
-        join.add_first(stamp, str(stamp))
-    assert (join.dropped_first, join.dropped_second) == (1, 0)
-    assert join.add_second(3, 30) is None
-    assert join.add_second(5, 50) == ("5", 50)
