@@ -22,7 +22,7 @@ from drocap_ros.reconstruction.live.core import LiveCore, Step
 from drocap_ros.reconstruction.live.frame_buffer import StreamEvent
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, EffortControl, Window
 from drocap_ros.recording.pose_messages import add_calibration, add_state, fixed_points_from_message
-from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
+from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode, Line, MessageInfo
 from drocap_ros.ros.conversions import (
     MAP,
     camera_transform,
@@ -37,17 +37,19 @@ from drocap_ros.ros.own_process import OwnProcess
 from drocap_ros.ros.topics import TFMessage
 from drocap_ros.skeleton import BODY_15, BODY_17
 
+_NICENESS = 19  # of the process that adjusts: it takes what the keypoints and the newest pose leave
+_STARVED = 2.0  # an adjustment that takes so many times its limit has waited: its longest step takes a fifth of it
 #: Joint sets of initial poses.
 _SKELETONS = (BODY_15.name, BODY_17.name)
 
 
 class BundleAdjusterNode(ComponentNode):
-    """Collects keypoints and initial poses and adjusts them in a worker thread every ``period_s``.
+    """Collects keypoints and initial poses and adjusts them in a process of its own every ``period_s``.
 
     The period is counted in image stamps, so that a replay at another speed adjusts the same windows.  An adjustment
     ends after the step in which ``max_solve_s`` is over; after a slow one the next takes fewer images.  The message's
     ``stride`` and ``steps`` state both, its ``telemetry_stamp`` and ``background_stamp`` what was known.  In simulated
-    time an adjustment has a process of its own and is never cut, and its result comes with the first image
+    time an adjustment is never cut, and its result comes with the first image
     ``max_solve_s`` after the newest one of its window.
     """
 
@@ -58,18 +60,19 @@ class BundleAdjusterNode(ComponentNode):
     def build(self) -> None:
         """Declare endpoints and state."""
         self._core = LiveCore(self.config)
-        adjust = LiveAdjuster(self.config).adjust
-        self._adjust = OwnProcess(adjust) if self.simulated else adjust
+        self._adjust = OwnProcess(LiveAdjuster(self.config).adjust_within, 0 if self.simulated else _NICENESS)
+        self._line = Line()
         self._control = EffortControl(self.config.max_solve_s, self.config.max_stride)
         self._worker = ThreadPoolExecutor(1, "bundle_adjuster")
         self._job: Future[Callable[[], None]] | None = None  # its result publishes what is left to publish
         self._job_due_ns = 0  # in simulated time
+        self._rests_until_s = 0.0
         self._camera_frame, self._sequence, self._subject_in_view = "", 0, True
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
         self._tf = self.output("/tf") if TFMessage is not None else None
         self.input("pose2d", self._on_pose2d)
-        self.input("pose3d/initial", self._on_initial)
+        self.input("pose3d/initial", self._on_initial, with_info=True)
         self.input("background", self._on_background)
         self.input("vehicle/state", partial(add_state, self._core.cameras))
         self.input("camera_info", partial(add_calibration, self._core.cameras))
@@ -80,10 +83,10 @@ class BundleAdjusterNode(ComponentNode):
             self._is_running(self._job_due_ns)
 
     def close(self) -> None:
-        """Wait for the running adjustment."""
+        """End the running adjustment."""
+        self._adjust.kill()
         self._worker.shutdown(wait=True, cancel_futures=True)
-        if isinstance(self._adjust, OwnProcess):
-            self._adjust.close()
+        self._adjust.close()
 
     def idle_reason(self) -> str:
         """Also: nobody to adjust, or too few images for a first adjustment."""
@@ -103,7 +106,9 @@ class BundleAdjusterNode(ComponentNode):
     def _on_background(self, message: BackgroundTracks) -> None:
         self._core.points.add(stamp_from_ros(message.header.stamp), fixed_points_from_message(message))
 
-    def _on_initial(self, message: Pose3D) -> None:
+    def _on_initial(self, message: Pose3D, info: MessageInfo) -> None:
+        begin_ns = time.time_ns()
+        self._core.behind = not self.simulated and self._line.passes_over(info, begin_ns)
         pose = pose3d_from_ros(message)
         if message.skeleton not in _SKELETONS:
             raise InputError(
@@ -111,6 +116,8 @@ class BundleAdjusterNode(ComponentNode):
             )
         self._camera_frame = message.header.frame_id
         self._on_step(self._core.add_initial(pose))
+        if not self._core.behind:
+            self._line.took((time.time_ns() - begin_ns) * 1e-9)
 
     def _on_step(self, step: Step | None) -> None:
         self.counters[Key.KEYPOINTS_UNPAIRED], self.counters[Key.INITIAL_UNPAIRED] = self._core.unpaired
@@ -122,10 +129,13 @@ class BundleAdjusterNode(ComponentNode):
             self.details[Key.FRAME] = self._camera_frame if step.latest.rotation is None else MAP
             self._latest.publish(pose3d_to_ros(step.latest, self.details[Key.FRAME]))
             self.count(Key.LATEST_POSES)
+            self.handled += 1
+        elif self._core.behind:
+            self.missed("pose3d/latest", 1)
         if not step.due:
             return
         stamp_ns = step.observation.stamp_ns
-        if self._is_running(stamp_ns):
+        if self._is_running(stamp_ns) or time.monotonic() < self._rests_until_s:
             self.count(Key.ADJUSTMENTS_SKIPPED)
             return
         self._job_due_ns = stamp_ns + round(self.config.max_solve_s * 1e9)
@@ -141,14 +151,18 @@ class BundleAdjusterNode(ComponentNode):
 
     def _solve(self, window: Window, effort: Effort) -> Callable[[], None]:
         """Adjust a window in the worker, which in real time also publishes the result."""
-        begin = time.perf_counter()
-        late = None if self.simulated else lambda: time.perf_counter() > begin + self.config.max_solve_s
+        begin, limit_s = time.perf_counter(), None if self.simulated else self.config.max_solve_s
         try:
-            solved = self._adjust(window, effort, late)
+            solved = self._adjust(window, effort, limit_s)
         except SOLVER_ERRORS as error:
             publish = partial(self._report_failure, str(error))
         else:
             publish = partial(self._publish, window, solved, time.perf_counter() - begin)
+        took_s = time.perf_counter() - begin
+        if limit_s is not None and took_s > _STARVED * limit_s and self._sequence:
+            # Its process waits for processors: it leaves them to the keypoints for as long again.  The first one waited
+            # for the process itself.
+            self._rests_until_s = time.monotonic() + took_s
         if self.simulated:
             return publish
         publish()

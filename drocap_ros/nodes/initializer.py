@@ -28,7 +28,7 @@ class InitializerNode(ComponentNode):
         """Declare endpoints and state."""
         self._initializer = LiveInitializer(self.config)
         self._initial = self.output("pose3d/initial")
-        self.input("pose2d", self._on_pose2d)
+        self.input("pose2d", self._on_pose2d, newest=True)
 
     def _on_pose2d(self, message: Pose2D) -> None:
         observation = pose2d_from_ros(message)

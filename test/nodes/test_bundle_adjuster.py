@@ -194,13 +194,13 @@ def initial_pose(observation, track_id, joints, skeleton=None):
 
 
 def test_initial_poses_of_another_subject_and_of_other_joints_do_not_end_the_node():
-    config = DrocapConfig().replace("bundle_adjuster", period_s=0.3, window_s=4.0, blend_s=1.0)
-    latest, reports = [], []
+    config = DrocapConfig().replace("bundle_adjuster", period_s=0.3, window_s=4.0, max_solve_s=5.0)
+    latest, reports, windows = [], [], []
     with bringup(config, ["bundle_adjuster"]) as graph:
         publishers = {}
         for topic in ("pose2d", "pose3d/initial"):
             publishers[topic] = graph.node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
-        for topic, into in (("pose3d/latest", latest), ("/diagnostics", reports)):
+        for topic, into in (("pose3d/latest", latest), ("pose3d/refined", windows), ("/diagnostics", reports)):
             graph.node.create_subscription(TOPICS[topic].message, topic, into.append, TOPICS[topic].qos)
         graph.wait_until(lambda: all(p.get_subscription_count() for p in publishers.values()), 20, "the node to listen")
 
@@ -213,6 +213,8 @@ def test_initial_poses_of_another_subject_and_of_other_joints_do_not_end_the_nod
         taken = [o for burst in range(4) for o in observed(1.0, begin_ns=BEGIN + 3 * S * burst)[::2]]
         for i, observation in enumerate(taken):
             publish(observation, 1, (15, 17)[i // 10 % 2])
+            if i % 10 == 9:
+                graph.wait_until(lambda burst=i // 10: len(windows) > burst, 30, "a window of these joints")
         for observation, pose in zip(
             observed(0.3, begin_ns=BEGIN + 14 * S), [(1, 17, "coco17"), (0, 0), (2, 15)], strict=False
         ):

@@ -27,9 +27,14 @@ def test_all_threads_of_a_process_get_its_priority(niceness, policy):
     assert run.stdout.strip() == str((expected, getattr(os, policy)))
 
 
-def test_flight_loop_and_pose_precede_all_other_nodes():
-    first = {name for name, node in NODES.items() if node.live and node.niceness == 0}
-    assert first == {"mavlink_bridge", "pose_estimator", "initializer"}
+def test_the_flight_loop_and_short_work_precede_the_keypoints_and_these_all_that_is_left():
+    live = {name: node.niceness for name, node in NODES.items() if node.live}
+    first, second, *last = (
+        {name for name in live if live[name] == niceness} for niceness in sorted(set(live.values()))
+    )
+    assert first == {"mavlink_bridge", "image_ingest", "initializer"}
+    assert second == {"pose_estimator", "bundle_adjuster"}
+    assert last == [{"session_recorder"}, {"visualizer"}]
 
 
 def run_node(*arguments):

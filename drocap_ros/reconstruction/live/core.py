@@ -38,7 +38,8 @@ class Step(NamedTuple):
     """An image whose keypoints and initial pose are both known.
 
     event : its relation to the images before; None where the stamp of the initial pose was refused
-    latest : with what the last window says of the person and the camera; None where the image is dropped
+    latest : with what the last window says of the person and the camera; None where the image is dropped, or a newer
+        one waits
     due : whether :meth:`LiveCore.window` is to be adjusted
     """
 
@@ -55,12 +56,14 @@ class LiveCore:
     The long work, :class:`~drocap_ros.reconstruction.live.adjuster.LiveAdjuster`, runs where its user wants.
 
     cameras, points : take the camera's reports and the scene's fixed points
+    behind : whether newer images wait, as its user knows: then none has a latest pose
     unpaired : keypoints, and initial poses, dropped without their counterpart
     """
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
         self.cameras, self.points = CameraHistory(config.window_s), PointHistory(config.window_s)
         self.unpaired = [0, 0]
+        self.behind = False
         #: Why the images have no calibration, in words.
         self._uncalibrated = ""
         self._had_telemetry = False
@@ -134,6 +137,8 @@ class LiveCore:
             self._lengths.reset()
             self._place.reset()
         self._take_solutions(observation.stamp_ns)
+        if self.behind:
+            return Step(observation, initial, event, due=due)
         latest = self._latest(observation, replace(initial, joints3d=joints, covariance=covariance))
         return Step(observation, initial, event, latest, due)
 
