@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,9 +12,11 @@ import pytest
 from rendered_person import rendered_images
 
 import drocap_ros
+from drocap_ros import api
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.motion import load_motion
+from drocap_ros.recording.video_telemetry import Telemetry
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
@@ -90,3 +93,16 @@ def test_every_function_has_types(root):
     assert set(re.findall(r"import (\w+) as \1", stub)) == set(drocap_ros.__all__)
     with pytest.raises(AttributeError, match="no attribute 'reconstuct'"):
         drocap_ros.reconstuct  # noqa: B018
+
+
+def test_the_log_beside_a_video_is_taken_as_a_path_as_words_and_with_its_options(tmp_path, monkeypatch):
+    taken = []
+
+    def reconstructed(*_, telemetry, **__):
+        taken.append(telemetry)
+        return None, None
+
+    monkeypatch.setattr(api, "reconstruct_input", reconstructed)
+    for given in (None, "flight.srt", tmp_path / "flight.srt", log := Telemetry(Path("a.srt"), 1.5)):
+        drocap_ros.reconstruct("walk.mp4", telemetry=given)
+    assert taken == [Telemetry(), Telemetry(Path("flight.srt")), Telemetry(tmp_path / "flight.srt"), log]

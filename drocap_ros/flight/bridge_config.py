@@ -10,6 +10,7 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
+OPERATOR_PERIOD_S, LEAST_OPERATOR_S = 0.5, 1.5  # between two signs of the operator; least time without any
 HEIGHT_ROOM_M = (0.3, 0.5)  # of an orbit from min_height_m and max_height_m: the error of its height
 
 
@@ -77,15 +78,30 @@ class SafetyConfig(Parameters):
     blind_hold_s: float = param(
         3.5, "longest hold while telemetry is silent or late: braking from 4.5 m/s takes 3.5 s", "s", 0.5, 30
     )
-    resume_after_hold_s: float = param(
-        0.0, "from the beginning of a hold by old data, in which the orbit may resume by itself; 0 = never", "s", 0, 30
+    max_orbit_s: float = param(
+        1200.0,
+        "longest time of an orbit, which then holds until the operator starts again; 0 = no limit",
+        "s",
+        0,
+        36000,
     )
+    operator_timeout_s: float = param(
+        0.0,
+        "longest time without a sign of the operator's console (`drocap orbit watch`), after which an orbit holds and "
+        "none begins; at least 1.5 s; 0 = none is expected",
+        "s", 0, 60,
+    )  # fmt: skip
     engage_timeout_s: float = param(
         5.0, "time for the autopilot to enter GUIDED or OFFBOARD after `engage`", "s", 1, 30
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if 0.0 < self.operator_timeout_s < LEAST_OPERATOR_S:
+            raise ParameterError(
+                f"operator_timeout_s: expected 0 (none is expected) or at least {LEAST_OPERATOR_S:g} s, "
+                f"got {self.operator_timeout_s:g}; the console gives a sign every {OPERATOR_PERIOD_S:g} s"
+            )
         if self.max_height_m < self.min_height_m + 1.0:
             raise ParameterError(
                 f"max_height_m: expected at least min_height_m and 1 m, {self.min_height_m + 1.0:g}, "
@@ -112,7 +128,12 @@ class SubjectConfig(Parameters):
 
     body_height_m: float = param(1.7, "assumed height of the subject", "m", 0.5, 2.5)
     ground_height_m: float = param(
-        0.0, "height of the subject's ground in the map frame; 0 = where the local frame begins", "m", -500, 500
+        0.0,
+        "CHANGE: height of the subject's ground in the autopilot's local frame, up: of the take-off place, as "
+        "preflight reads it on the ground, and how much higher he stands",
+        "m",
+        -500,
+        500,
     )
     use_ground_plane: bool = param(True, "use the range of the feet on level ground too; switch off on slopes")
     size_error: float = param(

@@ -126,11 +126,16 @@ class ConditionCode(enum.IntEnum):
     # Limits of place and speed
     TOO_FAST = 150, "speed of {speed_m_s:.1f} m/s above the limit"
     TOO_HIGH = 151, "height of {height_m:.1f} m at the limit of {limit_m:g} m"
-    TOO_LOW = 152, "height of {height_m:.1f} m at the lower limit of {limit_m:g} m"
+    TOO_LOW = 152, "height of {height_m:.1f} m, {source}, at the lower limit of {limit_m:g} m"
     AT_FENCE = 153, "{distance_m:.1f} m from where the orbit began: at the fence of {limit_m:g} m"
     COAST_UNSAFE = 154, "if the bridge failed now, the vehicle would {reach} before it stands"
     ORBIT_NOT_KEPT = 155, ("the vehicle has been more than {limit_m:.1f} m from its place on the orbit for {for_s:.0f} "
         "s, {away_m:.1f} m now: {verdict}")
+    HEIGHT_CONTRADICTED = 156, ("the vehicle is {height_m:.1f} m above the subject's ground as reported, and "
+        "{other_m:.1f} m {source}: set ground_height_m to that ground and body_height_m to the subject")
+    ORBIT_TIME_OVER = 157, "the orbit has lasted max_orbit_s, {limit_s:g} s"
+    OPERATOR_SILENT = 158, ("no sign of the operator; last one: {ago}; `drocap orbit watch` gives it while its console "
+        "lives")
     # Subject
     NO_SUBJECT = 200, "no subject is tracked"
     SUBJECT_OUTDATED = 201, "the subject was last located {ago}"
@@ -153,13 +158,8 @@ class ConditionCode(enum.IntEnum):
 
 #: The subject's position is outdated: by a fault of the pictures, or he is not found in them.
 PICTURE_CODES = frozenset(
-    {
-        ConditionCode.SUBJECT_OUTDATED,
-        ConditionCode.PICTURES_LOST,
-        ConditionCode.PICTURES_LATE,
-        ConditionCode.PICTURES_FROZEN,
-        ConditionCode.OTHER_SUBJECT,
-    }
+    getattr(ConditionCode, name)
+    for name in ("SUBJECT_OUTDATED", "PICTURES_LOST", "PICTURES_LATE", "PICTURES_FROZEN", "OTHER_SUBJECT")
 )
 
 #: Factor of a limit that a command may reach: its values are float32, and limits are sums of decimal fractions.

@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.flight.autopilot.autopilot import UNKNOWN, Autopilot, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode
 
+_TERRAIN_SD_M = 0.5  # of the ground below the vehicle about the subject's
 FIX_3D: int = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
@@ -80,6 +81,16 @@ class Health:
         return self.position_ok and self.gps_fix_type >= FIX_3D
 
 
+class Height(NamedTuple):
+    """A height in m and its standard deviation; NaN = unknown."""
+
+    m: float = math.nan
+    sd_m: float = math.inf
+
+
+NO_HEIGHT = Height()
+
+
 @dataclass(frozen=True)
 class Motion:
     """The vehicle's motion.
@@ -87,7 +98,8 @@ class Motion:
     position, velocity : (3,) m, m/s; the position as reported, extrapolated over the age of the state; the velocity of
         the filter
     velocity_offset : (3,) m/s, reported minus filtered velocity: the autopilot flies by the reported one
-    height_m : above the subject's ground
+    height : above the subject's ground, as reported
+    clearance_m : of a range finder that looks down; NaN = none
     age_s : of the attitude
     position_age_s : since the reported position last changed, so frozen telemetry ages too
     """
@@ -96,7 +108,8 @@ class Motion:
     velocity: np.ndarray = field(default_factory=_unknown)
     velocity_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     yaw: float = math.nan
-    height_m: float = math.nan
+    height: Height = NO_HEIGHT
+    clearance_m: float = math.nan
     age_s: float = math.inf
     position_age_s: float = math.inf
 
@@ -132,7 +145,7 @@ class Subject:
     position : (3,) m; None = nobody was located
     contradicted : whether images since he was located showed something else in his place
     nearer : share of his distance by which the nearer of body size and ground puts him nearer
-    size_over_ground : ratio of his distances by body size and by the ground; NaN = unknown
+    ground : his ground by his body alone, which the reported height has no part in
     distance_m : horizontal
     closing_m_s, approach_m_s : speed of the vehicle towards him, and of him towards the vehicle
     approach_sd_m_s : standard deviation of ``approach_m_s``
@@ -145,7 +158,7 @@ class Subject:
     contradicted: bool = False
     sd_m: float = math.inf
     nearer: float = 0.0
-    size_over_ground: float = math.nan
+    ground: Height = NO_HEIGHT
     distance_m: float = math.nan
     closing_m_s: float = 0.0
     approach_m_s: float = 0.0
@@ -192,6 +205,8 @@ class Observed:
     loss_settings : the autopilot's settings for the loss of setpoints
     intruder : another one that commands, or whose keypoints would be followed
     disturbance : a condition that ends motion and that no other field shows
+    operator_age_s : since the last sign of the operator
+    stalled_s : for how long our own loop has just stood still; 0 = it has not, and a long stand is a disturbance too
     refusal : why the autopilot does not enter the requested mode, as a sentence; "" = it does not refuse
     """
 
@@ -207,7 +222,20 @@ class Observed:
     course: Course = Course()
     intruder: Condition | None = None
     disturbance: Condition | None = None
+    operator_age_s: float = math.inf
+    stalled_s: float = 0.0
     refusal: str = ""
+
+    @property
+    def heights(self) -> dict[str, Height]:
+        """The vehicle's height above the subject's ground by everything that tells it, the reported one first."""
+        ground, clearance_m = self.subject.ground, self.vehicle.clearance_m
+        heights = {
+            "as reported": self.vehicle.height,
+            "by the subject's image": Height(float(self.vehicle.position[2]) - ground.m, ground.sd_m),
+            "by the range finder": Height(clearance_m, _TERRAIN_SD_M),
+        }
+        return {source: height for source, height in heights.items() if math.isfinite(height.m)}
 
     @property
     def jumped(self) -> bool:

@@ -177,10 +177,9 @@ class MavlinkBridgeNode(ComponentNode):
 
     def _answer_commands(self, status: ControlStatus) -> None:
         for command, answer in status.answers:
-            self.count(Key.ORBIT_COMMANDS if answer.accepted else Key.ORBIT_COMMANDS_REFUSED)
             code, words = int(answer.condition.code), str(answer.condition)
             response = OrbitCommand.Response(accepted=answer.accepted, condition=code, words=words)
-            self._last_command = {
+            last: Values = {
                 "command": command.kind,
                 "command_accepted": answer.accepted,
                 "command_condition": code,
@@ -188,10 +187,13 @@ class MavlinkBridgeNode(ComponentNode):
             }
             for entry in self._unanswered:
                 if entry[0] is command:
-                    self._last_command["command_stamp"] = entry[1].stamp
+                    last["command_stamp"] = entry[1].stamp
                     self.requests.answer(entry[2], response)
             self._unanswered = [entry for entry in self._unanswered if entry[0] is not command]
-            self._publish_status(status)
+            if command.kind != Command.PRESENT:  # a sign changes nothing
+                self.count(Key.ORBIT_COMMANDS if answer.accepted else Key.ORBIT_COMMANDS_REFUSED)
+                self._last_command = last
+                self._publish_status(status)
 
     def _report_status(self, status: ControlStatus) -> None:
         """Publish every change at once, except while idle, and else five times a second."""

@@ -339,7 +339,7 @@ def wrong_ground(lower_m: float) -> Callable[[LoopSettings], LoopSettings]:
         return with_config(
             settings, ground_height_m=config.ground_height_m + lower_m,
             height_m=config.height_m + max(-lower_m, 0.0), max_height_m=8.0, gimbal_control=True,
-            size_error=0.04,
+            size_error=0.04, height_error_m=1.0,
         )  # fmt: skip
 
     return change

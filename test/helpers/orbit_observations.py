@@ -8,7 +8,7 @@ import numpy as np
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.observed import Course, Health, Link, Mode, Motion, Observed, Pictures, Subject
+from drocap_ros.flight.observed import Course, Health, Height, Link, Mode, Motion, Observed, Pictures, Subject
 from drocap_ros.flight.orbit.safety import reduce
 from drocap_ros.flight.orbit.states import Action, Command, Idle, Limits, State
 
@@ -39,6 +39,8 @@ def changed(seen, **values):
     parts = {}
     if "autopilot" in values:
         values |= {"autopilot": autopilot_of(values["autopilot"]), "autopilot_name": values["autopilot"]}
+    if "height_m" in values:
+        values["height"] = Height(values.pop("height_m"), 0.5)
     for name, value in values.items():
         if name in FIELDS:
             part, field = FIELDS[name]

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 from visualization_msgs.msg import ImageMarker, Marker
@@ -124,3 +126,12 @@ def test_without_a_subject_the_keypoints_are_removed():
 def test_prefix_distinguishes_the_frames_of_two_drones():
     message, _, _ = pose()
     assert {t.child_frame_id.split("/")[0] for t in body_transforms(message, "drone2/")} == {"drone2"}
+
+
+def test_an_unknown_covariance_draws_no_ellipsoid_of_unknown_axes():
+    message, _, _ = pose()
+    message.covariance[6 * 3] = math.nan
+    message.covariance[6 * 5 + 4] = math.inf
+    balls = by_namespace(pose_markers(message, 0.5), "uncertainty")
+    assert [ball.id for ball in balls] == [i for i in range(15) if i not in (3, 5)]
+    assert all(math.isfinite(v) for ball in balls for v in (ball.scale.x, ball.scale.y, ball.scale.z))

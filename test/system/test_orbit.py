@@ -17,6 +17,7 @@ from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.transport import open_transport
+from drocap_ros.flight.orbit.states import Command
 from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import OrbitStatus
@@ -134,6 +135,28 @@ def test_operator_flies_an_orbit_from_the_command_line():
         assert operator(graph, "stop") == (0, "acknowledged by the operator")
         graph.wait_until(lambda: got[-1].command_accepted, 10, "a status with the accepted command")
         assert got[-1].command_condition == OrbitStatus.CONDITION_ACKNOWLEDGED
+
+
+def test_an_operator_whose_console_dies_is_missed():
+    values = {"commands_enabled": True, "max_state_age_s": 0.5, "watchdog_s": 0.5, "operator_timeout_s": 2.0}
+    with flying(**values) as (graph, _, got):
+        graph.wait_until(lambda: got and got[-1].condition == ConditionCode.OPERATOR_SILENT, 40, "the lack of him")
+        place = ["--domain-id", str(graph.domain_id), "--namespace", graph.namespace]
+        command = [sys.executable, "-m", "drocap_ros.cli", "orbit", "watch", *place, "--timeout", "20"]
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) as console:
+            try:
+                graph.wait_until(lambda: got[-1].state == OrbitStatus.READY, 40, "readiness")
+                assert operator(graph, "start", "--speed", "15") == (0, "orbiting the subject")
+                begin = time.monotonic()
+                graph.wait_until(lambda: time.monotonic() - begin > 4, 30)
+                assert got[-1].state == OrbitStatus.ORBITING
+                assert got[-1].command == Command.START  # a sign is no command
+            finally:
+                console.kill()
+            graph.wait_until(lambda: got[-1].state == OrbitStatus.HOLDING, 10, "a hold")
+            assert got[-1].condition == ConditionCode.OPERATOR_SILENT
+            assert "orbiting" in console.stdout.read()
 
 
 def test_a_second_publisher_of_the_keypoints_ends_the_orbit_and_forbids_another():

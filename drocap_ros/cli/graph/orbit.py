@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import math
 import time
+from collections import deque
 from typing import TYPE_CHECKING
 
 from drocap_ros.cli.graph.common import add_place_options, chosen_domain, import_bringup
@@ -29,9 +30,11 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Send a command to the mavlink_bridge of a running graph and print the answer. Exit status 1 when "
         "the command is refused. `start` needs the vehicle in GUIDED or OFFBOARD already; `engage` requests that mode "
         "from the autopilot first. Values that are not given stay with `adjust`; `start` and `engage` take the "
-        "configured ones, also after a hold.",
+        "configured ones, also after a hold. `watch` prints every change until Ctrl-C, and tells the bridge that this "
+        "console lives (operator_timeout_s).",
     )
-    parser.add_argument("action", choices=("start", "engage", "adjust", "stop", "status"), help="command to send")
+    actions = ("start", "engage", "adjust", "stop", "status", "watch")
+    parser.add_argument("action", choices=actions, help="command to send")
     parser.add_argument("--radius", metavar="M", type=float, help="m, from the subject")
     parser.add_argument("--height", metavar="M", type=float, help="m, above the subject's ground")
     parser.add_argument("--speed", metavar="DEG_S", type=float, help="deg/s, positive = counter-clockwise from above")
@@ -44,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
     domain_id = chosen_domain(args)
     _check_options(args)
     bringup = import_bringup()
+    from drocap_ros.flight.bridge_config import OPERATOR_PERIOD_S
     from drocap_ros.flight.orbit.states import Command
     from drocap_ros.ros.conversions import orbit_request
     from drocap_ros.ros.topics import RESULT_QOS, SERVICES, TOPICS
@@ -54,16 +58,24 @@ def run(args: argparse.Namespace) -> int:
     )
     end_s = time.monotonic() + args.timeout
     with bringup.watch(args.namespace, domain_id) as graph:
-        if args.action == "status":
-            statuses: list[Message] = []
-            graph.node.create_subscription(TOPICS["orbit/status"].message, "orbit/status", statuses.append, RESULT_QOS)
+        statuses: deque[Message] = deque(maxlen=1)
+        if args.action in ("status", "watch"):
+            kind = TOPICS["orbit/status"].message
+            graph.node.create_subscription(kind, "orbit/status", lambda heard: statuses.append(heard), RESULT_QOS)
             if not graph.wait(lambda: bool(statuses), end_s - time.monotonic()):
                 raise no_graph
-            print(_sentence(statuses[-1]))
+            print(_sentence(statuses[-1]), flush=True)
+        if args.action == "status":
             return 0
         client = graph.node.create_client(SERVICES["orbit/command"], "orbit/command", qos_profile=RESULT_QOS)
         if not graph.wait(client.service_is_ready, end_s - time.monotonic()):
             raise no_graph
+        told = statuses[-1] if statuses else None
+        while told is not None:
+            client.call_async(orbit_request(graph.node, int(Command.PRESENT)))
+            graph.wait(lambda: False, OPERATOR_PERIOD_S)
+            if (statuses[-1].state, statuses[-1].condition) != (told.state, told.condition):
+                print(_sentence(told := statuses[-1]), flush=True)
         wanted = (args.radius, args.height, args.speed)
         radius, height, speed = (math.nan if value is None else value for value in wanted)
         command = int(Command[args.action.upper()])
@@ -89,7 +101,7 @@ def _check_options(args: argparse.Namespace) -> None:
         # To the bridge NaN means the configured value: a failed computation must not start another orbit.
         if not math.isfinite(value):
             raise InputError(f"{name}: expected a finite number, got {value:g}; correct the value or leave it out")
-        if args.action in ("stop", "status"):
+        if args.action in ("stop", "status", "watch"):
             raise InputError(f"{name}: {args.action} takes no values; leave it out")
         _check_range(name, value)
 

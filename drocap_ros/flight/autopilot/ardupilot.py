@@ -7,9 +7,7 @@ from collections.abc import Callable
 from drocap_ros.flight.autopilot.autopilot import (
     Airframe,
     Autopilot,
-    CoastLimits,
     Decay,
-    Echo,
     Fence,
     FenceSettings,
     FlownSpeeds,
@@ -71,9 +69,11 @@ ARDUPILOT = Autopilot(
     ),
     # Gusts, turns and the way add to a steady flight.  Of 204 deaths of the bridge 98 % moved by 2.5 m at most; with a
     # greatest share of 0.935 94 % did.
-    coast=CoastLimits(steady=0.75, greatest=0.9),
+    steady_coast=0.75,
+    greatest_coast=0.9,
     gives_way_s=1.2,  # fitted in the closed loop: the vehicle leans before it flies away
-    echo=Echo(place_m=0.5, velocity_m_s=0.75),  # its target is the setpoint, integrated
+    echo_m=0.5,  # its target is the setpoint, integrated
+    echo_m_s=0.75,
     mount_type_setting="MNT1_TYPE",
     servo_mount=1,
     checks=(

@@ -215,6 +215,7 @@ class Hints(NamedTuple):
     battery : settings of a battery monitor with a current sensor
     by_hand : how the pilot enters the control mode; "" = the pilot cannot
     engaged : why the operator has to engage instead
+    limits : what orbits under it cannot do yet
     """
 
     port: str = ""
@@ -222,25 +223,11 @@ class Hints(NamedTuple):
     battery: str = ""
     by_hand: str = ""
     engaged: str = ""
-
-
-class CoastLimits(NamedTuple):
-    """Shares of ``max_coast_m``: of a steady flight, to which gusts, turns and the way add, and of any setpoint."""
-
-    steady: float
-    greatest: float
-
-
-class Echo(NamedTuple):
-    """How far the echoed target may be from a setpoint that was sent: m, and m/s (infinite = another velocity)."""
-
-    place_m: float
-    velocity_m_s: float
+    limits: str = ""
 
 
 # Of an unknown autopilot: nothing flies it.
-_NO_COASTING, _NO_COAST = HeldCoasting(0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.5), CoastLimits(0.5, 0.5)
-_NO_ECHO, _NO_HINTS = Echo(0.0, 0.0), Hints()
+_NO_COASTING, _NO_HINTS = HeldCoasting(0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.5), Hints()
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,9 +264,11 @@ class Autopilot:
     timeout_setting : parameter of the time-out without setpoints, s; "" = none
     shipped_timeout_s : its value where it is not reported
     loss_action : what follows it; None = it holds its position in the control mode
-    coasting : motion after the last setpoint;  coast : shares of the longest coast
+    coasting : motion after the last setpoint
+    steady_coast, greatest_coast : shares of ``max_coast_m``: of a steady flight, to which gusts, turns and the way add,
+        and of any setpoint
     gives_way_s : of the way of one who walks up to the vehicle, by which he comes nearer before it flies as fast
-    echo : distance of the echoed target from what was sent
+    echo_m, echo_m_s : how far the echoed target may be from what was sent; infinite = it has another velocity
 
     Its settings before a flight
 
@@ -316,9 +305,11 @@ class Autopilot:
     shipped_timeout_s: float = math.inf
     loss_action: LossAction | None = None
     coasting: Coasting = _NO_COASTING
-    coast: CoastLimits = _NO_COAST
+    steady_coast: float = 0.5
+    greatest_coast: float = 0.5
     gives_way_s: float = 2.4  # of the slowest one
-    echo: Echo = _NO_ECHO
+    echo_m: float = 0.0
+    echo_m_s: float = 0.0
 
     mount_type_setting: str = ""
     servo_mount: float = math.nan

@@ -8,9 +8,7 @@ from collections.abc import Callable
 from drocap_ros.flight.autopilot.autopilot import (
     Airframe,
     Autopilot,
-    CoastLimits,
     Decay,
-    Echo,
     Fence,
     FenceSettings,
     FlownSpeeds,
@@ -100,9 +98,11 @@ PX4 = Autopilot(
     ),
     # Its estimate wanders while the vehicle stops, and the vehicle follows it.  With less than this it falls behind
     # subjects who walk at 1.4 m/s, and loses them.
-    coast=CoastLimits(steady=0.63, greatest=0.82),
+    steady_coast=0.63,
+    greatest_coast=0.82,
     gives_way_s=2.4,  # fitted in the closed loop: slower by its coast
-    echo=Echo(place_m=0.2, velocity_m_s=math.inf),  # the place as it came; the velocity has the correction of the place
+    echo_m=0.2,  # the place as it came; the velocity has the correction of the place
+    echo_m_s=math.inf,
     checks=(
         SettingCheck(
             "MPC_XY_VEL_MAX",
@@ -140,6 +140,7 @@ PX4 = Autopilot(
         port=" (MAV_n_MODE Onboard)",
         battery=" (BAT1_CAPACITY)",
         engaged="PX4 grants OFFBOARD only while setpoints arrive",
+        limits="it circles a subject who stands, and does not keep up with one who walks yet",
     ),
     simulated=Simulated(
         stick_mode="POSCTL",

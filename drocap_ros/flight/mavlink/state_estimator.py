@@ -150,7 +150,7 @@ _ESTIMATOR_NEEDED |= mavlink.ESTIMATOR_POS_VERT_ABS
 _ESTIMATOR_POSITION = mavlink.ESTIMATOR_POS_HORIZ_REL | mavlink.ESTIMATOR_POS_HORIZ_ABS
 
 _STALE_S = 3.0  # of position and estimator's health, which come once a second at least: a link's silence counts then
-_QUATERNION_PREFERRED_S = 1.0  # after one, the angles of the same attitude do not count
+_FRESH_S = 1.0  # of a quaternion, beside which angles do not count, and of a range finder
 _EXTRAPOLATE_S = 0.5  # by the velocity, from the position to the attitude: positions come at 2 Hz at least
 
 
@@ -182,6 +182,7 @@ class VehicleStateEstimator:
         self._origin: np.ndarray | None = None
         self._estimator: tuple[int, int] | None = None  # reception, flags
         self._attitude_received_ns = 0
+        self._clearance = (-(10**18), math.nan)
         self._reported = VehicleState(0)  # what comes with neither attitude nor position
         #: The target that the autopilot follows, and its reception.
         self.echo: tuple[int, Message] | None = None
@@ -294,7 +295,7 @@ class VehicleStateEstimator:
 
     def _take_attitude(self, message: Message, now_ns: int) -> bool:
         # With both forms of the attitude only the quaternion is used: one state for each instant.
-        if (now_ns - self._quaternion_ns) / NS < _QUATERNION_PREFERRED_S:
+        if (now_ns - self._quaternion_ns) / NS < _FRESH_S:
             return False
         angles = (message.roll, message.pitch, message.yaw)
         if not all(map(math.isfinite, angles)):
@@ -370,6 +371,17 @@ class VehicleStateEstimator:
         self._report(landed_state=int(message.landed_state) if 0 <= message.landed_state <= 4 else 0)
         return False
 
+    def _take_range_finder(self, message: Message, now_ns: int) -> bool:
+        if message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270:
+            in_range = message.min_distance <= message.current_distance < message.max_distance
+            self._clearance = now_ns, message.current_distance * 1e-2 if in_range else math.nan
+        return False
+
+    def clearance_m(self, now_ns: int) -> float:
+        """Distance below the vehicle by its range finder; NaN without a fresh one."""
+        received_ns, distance_m = self._clearance
+        return distance_m if abs(now_ns - received_ns) / NS < _FRESH_S else math.nan
+
     def _take_mount(self, message: Message, now_ns: int) -> bool:
         self.mount.take(message, now_ns)
         return False
@@ -409,5 +421,6 @@ _HANDLERS = {
     "POSITION_TARGET_LOCAL_NED": VehicleStateEstimator._take_echo,
     "PARAM_VALUE": VehicleStateEstimator._take_parameter,
     "SYSTEM_TIME": VehicleStateEstimator._take_system_time,
+    "DISTANCE_SENSOR": VehicleStateEstimator._take_range_finder,
     **dict.fromkeys(MESSAGES, VehicleStateEstimator._take_mount),
 }

@@ -70,6 +70,15 @@ class CommandDesk:
         self._config = config
         self._waiting: deque[OperatorCommand] = deque()
         self._answers: list[tuple[OperatorCommand, CommandAnswer]] = []
+        self.operator_s = -math.inf  # monotonic, of the last sign of the operator
+
+    def hear_operator(self, now_ns: int, now_s: float) -> None:
+        """Take the operator's signs among the commands; one with an old stamp is none."""
+        for sign in [command for command in self._waiting if command.kind == Command.PRESENT]:
+            self._waiting.remove(sign)
+            late = command_condition(sign, now_ns)
+            self.operator_s = self.operator_s if late else now_s
+            self.answer(sign, CommandAnswer(late is None, late or condition(ConditionCode.NONE)))
 
     def take(self, command: OperatorCommand) -> None:
         """Take a command.  Of too many the oldest that is no stop is dropped: never a stop for another command."""

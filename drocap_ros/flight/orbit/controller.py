@@ -150,7 +150,8 @@ class OrbitController:
         hung = self._watchdog_acted()
         orbiting_s = now_s - self.safety.since_s if self.safety.state == State.ORBITING else 0.0
         refusal = self._queue.failure(SET_MODE)
-        own = OwnFlight(orbiting_s, self._orbit.place, hung, self._orbit.unsafe, self.intruder, refusal)
+        unheard_s = now_s - self._desk.operator_s
+        own = OwnFlight(orbiting_s, self._orbit.place, hung, self._orbit.unsafe, self.intruder, refusal, unheard_s)
         seen, dt = self._observer.observe(self._link, now_ns, now_s, own)
         request = self._decide(seen, now_ns, now_s, hung=hung)
         self._observer.forget_changed_camera()
@@ -170,6 +171,7 @@ class OrbitController:
 
     def _decide(self, seen: Observed, now_ns: int, now_s: float, *, hung: bool) -> tuple[Action, ModeRequest]:
         """The next state of the machine, and what may be sent in it; executes a command."""
+        self._desk.hear_operator(now_ns, now_s)
         order = self._desk.next(now_ns, self.safety, self._orbit.goal, self._observer.framing)
         before = self.safety
         limits = self._limits._replace(warm_up_s=seen.autopilot.warm_up_s)
@@ -279,10 +281,10 @@ class OrbitController:
             condition=self._orbit.flown_condition(present, seen) if orbiting else present,
             failed=self.safety.failed if isinstance(self.safety, Idle) else None,
             mode_failure=self._queue.failure(SET_MODE),
-            way_out=way_out(self.safety, seen, mode_change_allowed=self._config.mode_change_allowed),
+            way_out=way_out(self.safety, seen, self._limits),
             answers=self._desk.take_answers(),
             radius_m=distance_m,
-            height_m=vehicle.height_m,
+            height_m=vehicle.height.m,
             angular_speed_deg_s=omega,
             radius_error_m=distance_m - self._orbit.goal.radius_m if orbiting else math.nan,
             yaw_error_deg=yaw_error,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.flight.autopilot.autopilot import Echo
+from drocap_ros.flight.autopilot.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import OrbitConfig
 from drocap_ros.flight.mavlink.commands import Message
 from drocap_ros.flight.orbit.motion_checks import away_limit_m
@@ -24,6 +24,7 @@ from drocap_ros.flight.vehicle import VehicleState
 
 _SENT_S = 0.7  # a setpoint may be echoed for so long at most: two transmissions and the period of the echo
 _ECHOED_S = 0.25  # two periods of the echo, and a step: beyond its age and two transmissions, and without agreement
+_STANDS_M_S = 1e-3  # of a target: the time-out writes zeros
 _AHEAD_S = 0.5  # along its velocity, by which the echoed place may be ahead
 #: Window in s, least commanded speed in m/s, and share of the commanded speed below which the vehicle stands for all
 #: of the window.  In every recorded flight of the orbit it reached 0.46, and along the command, with the way, 0.27.
@@ -67,10 +68,10 @@ class Following:
             self._by_way.clear()
             return ""
         autopilot = autopilot_of(vehicle.autopilot)
-        evidence = self._by_echo(now_s, orbiting_s, echoes, autopilot.echo)
+        evidence = self._by_echo(now_s, orbiting_s, echoes, autopilot)
         return evidence or self._by_motion(now_s, echoes.sent[-1][1], vehicle, autopilot.position_gain_per_s)
 
-    def _by_echo(self, now_s: float, orbiting_s: float, echoes: Echoes, most: Echo) -> str:
+    def _by_echo(self, now_s: float, orbiting_s: float, echoes: Echoes, autopilot: Autopilot) -> str:
         sent, echo, trip_s = echoes
         if echo is None:
             return ""
@@ -78,8 +79,11 @@ class Following:
         if min(age_s, orbiting_s) > self._max_echo_age_s:
             return f"no echo of a target for {age_s:.1f} s"
         oldest_s = min(_SENT_S, age_s + trip_s + _ECHOED_S) if math.isfinite(trip_s) else _SENT_S
-        if _agrees(target, [message for at_s, message in sent if now_s - at_s <= oldest_s], most):
+        followed = [message for at_s, message in sent if now_s - at_s <= oldest_s]
+        if _agrees(target, followed, autopilot):
             self._matched_s = now_s
+        elif self._matched_s == self._matched_s and _stands(target) and not any(map(_stands, followed)):
+            return "the autopilot has stopped by its time-out, without setpoints"
         # NaN: its content has not agreed yet, and is not judged.
         return "the autopilot's target is none that was sent" if now_s - self._matched_s > _ECHOED_S else ""
 
@@ -144,7 +148,12 @@ class Keeping:
         return away_m, now_s - self._near_s
 
 
-def _agrees(echo: Message, sent: list[Message], most: Echo) -> bool:
+def _stands(target: Message) -> bool:
+    """Whether a target has no velocity."""
+    return math.hypot(target.vx, target.vy) < _STANDS_M_S
+
+
+def _agrees(echo: Message, sent: list[Message], most: Autopilot) -> bool:
     """Whether the echoed target lies on the way of a setpoint, and has its velocity."""
     place = np.array([echo.x, echo.y], dtype=float)
     if not sent or not np.isfinite(place).all():
@@ -154,7 +163,7 @@ def _agrees(echo: Message, sent: list[Message], most: Echo) -> bool:
     way = _AHEAD_S * velocity
     part = ((place - begin) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-9)
     nearest = begin + np.clip(part, 0.0, 1.0)[:, None] * way
-    near = np.hypot(*(place - nearest).T) <= most.place_m
-    if math.isfinite(most.velocity_m_s):
-        near &= np.hypot(*(np.array([echo.vx, echo.vy], dtype=float) - velocity).T) <= most.velocity_m_s
+    near = np.hypot(*(place - nearest).T) <= most.echo_m
+    if math.isfinite(most.echo_m_s):
+        near &= np.hypot(*(np.array([echo.vx, echo.vy], dtype=float) - velocity).T) <= most.echo_m_s
     return bool(near.any())

@@ -84,7 +84,6 @@ def begin_hold(
         blind=blind and not fresh,
         retreats=retreats,
         hold_mode_s=None if seen.course.followed else now_s,
-        resumable=reason.code in _HARMLESS,
         jumped_s=now_s if seen.jumped else -math.inf,
     )
 
@@ -155,27 +154,14 @@ def update_hold(state: Holding, seen: Observed, now_s: float, blind: bool) -> Ho
     return Fault(**{**vars(state), "since_s": now_s, "condition": reason})
 
 
-def resumption(
-    state: Holding, seen: Observed, now_s: float, problem: Condition | None, config: SafetyConfig
-) -> Holding:
-    """Note since when all is clear in a hold that may end by itself; any other cause takes this permission away."""
-    if not state.resumable:
-        return state
-    over = now_s - state.since_s > config.resume_after_hold_s or seen.mode.in_hold or not seen.mode.in_control
-    if over or (problem is not None and problem.code not in _HARMLESS):
-        return dataclasses.replace(state, resumable=False, clear_s=None)
-    if problem is not None:
-        return dataclasses.replace(state, clear_s=None)
-    return state if state.clear_s is not None else dataclasses.replace(state, clear_s=now_s)
-
-
 def retreat(state: Holding, seen: Observed, now_s: float, limits: Limits) -> Holding:
     """Move the hold position away from an approaching subject, at most to the fence, and never nearer to the subject.
 
     Only a subject that is located counts, and only until the autopilot's hold mode has been requested.
     """
     place, subject, fence, safety = state.position, seen.subject.position, state.fence_centre, limits.safety
-    if place is None or subject is None or fence is None or not _may_retreat(state, seen, safety):
+    settled = not state.retreats or state.blind or state.hold_mode_s is not None or seen.mode.in_hold
+    if place is None or subject is None or fence is None or settled or not subject_located(seen, safety):
         return state
     wanted = limits.orbit.min_distance_m + seen.subject.sd_m + _LEAD_S * max(seen.subject.approach_m_s, 0.0) + _CLEAR_M
     if not seen.subject.distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
@@ -188,17 +174,10 @@ def retreat(state: Holding, seen: Observed, now_s: float, limits: Limits) -> Hol
     return dataclasses.replace(state, position=np.append(target, place[2]), retreated_s=now_s)
 
 
-def _may_retreat(state: Holding, seen: Observed, safety: SafetyConfig) -> bool:
-    settled = state.blind or state.hold_mode_s is not None or seen.mode.in_hold
-    return state.retreats and not settled and subject_located(seen, safety)
-
-
 def request_hold_mode(state: Holding, seen: Observed, now_s: float, config: SafetyConfig) -> Holding:
     """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``; not on a lossy link."""
     awaited = not isinstance(state, Fault) and state.hold_mode_s is None and not state.sight.lost
     if not awaited or state.blind or seen.link.packet_loss > MAX_LOSS:
-        return state
-    if state.resumable and now_s - state.since_s <= config.resume_after_hold_s:
         return state
     slow = bool(np.linalg.norm(seen.vehicle.velocity) < _AT_REST_M_S)
     if slow == (state.slow_s is None):
@@ -229,11 +208,6 @@ def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> S
     # The vehicle is held where it is now, and not led back: setpoints may have ended, or its position been reset.
     known = bool(np.isfinite(seen.vehicle.position).all()) and seen.health.located
     return dataclasses.replace(state, position=seen.vehicle.position.copy() if known else None, yaw=seen.vehicle.yaw)
-
-
-def is_silent(state: SafetyState, now_s: float, limits: Limits) -> bool:
-    """Whether the vehicle has been out of sight for so long that nothing is sent any more."""
-    return state.sight.lost_s is not None and now_s - state.sight.lost_s > limits.safety.blind_hold_s
 
 
 def mode_visible(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> bool:

@@ -20,6 +20,7 @@ REACTION_S = 0.5  # from a step of the subject until the vehicle slows down
 OWN_SPEED_SD_M_S = 0.1  # of the reported velocity
 _LEAST_SUBJECT_AGE_S = 0.25  # the usual age of a picture at 15 Hz, its network included
 WAITING_LEADS = 1.3  # of max_lead_m: beyond it the reference stands
+_SURE = 3.0  # standard deviations
 _CARRIED_OFF = 3.0  # times that limit: beyond the 3.7 m that vehicles were behind walking subjects
 GUST_S = 1.0  # away for so long: a gust passes
 _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
@@ -42,15 +43,23 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
     if not safety.commands_enabled:
         return condition(_C.COMMANDS_DISABLED)
     oldest_s = oldest_state_s(safety, patient=patient)
+    silent = 0.0 < safety.operator_timeout_s < seen.operator_age_s
     return (
         seen.disturbance
+        or (stalled_condition(seen) if seen.stalled_s and not patient else None)
         or _autopilot_condition(seen, limits, oldest_s)
         or _state_condition(seen, safety, oldest_s)
         or _health_condition(seen, safety)
         or battery_condition(seen.health.battery_fraction, seen.health.battery_voltage_v, safety)
         or seen.pictures.camera_problem
         or seen.intruder
+        or (condition(_C.OPERATOR_SILENT, age_s=seen.operator_age_s) if silent else None)
     )
+
+
+def stalled_condition(seen: Observed) -> Condition:
+    """That our own loop stood still."""
+    return condition(_C.CONTROL_LOOP_STALLED, gap_s=seen.stalled_s)
 
 
 def _autopilot_condition(seen: Observed, limits: Limits, oldest_s: float) -> Condition | None:
@@ -108,7 +117,7 @@ def start_condition(seen: Observed) -> Condition | None:
     own_loss = seen.mode.left_by_itself and seen.mode.in_hold
     if seen.health.system_status == mavlink.MAV_STATE_CRITICAL and not own_loss:
         return condition(_C.AUTOPILOT_CRITICAL, reported="a critical state")
-    return None
+    return contradicted_height(seen) if seen.vehicle.known else None
 
 
 def battery_condition(charge: float, volts: float, safety: SafetyConfig) -> Condition | None:
@@ -156,16 +165,33 @@ def limit_condition(seen: Observed, fence_centre: np.ndarray | None, limits: Lim
         return condition(_C.TOO_FAST, speed_m_s=speed)
     climb = float(seen.vehicle.velocity[2])
     margin = braking_distance(climb, safety)
-    if seen.vehicle.height_m + (margin if climb > 0 else 0.0) > safety.max_height_m:
-        return condition(_C.TOO_HIGH, height_m=seen.vehicle.height_m, limit_m=safety.max_height_m)
-    if seen.vehicle.height_m - (margin if climb < 0 else 0.0) < safety.min_height_m:
-        return condition(_C.TOO_LOW, height_m=seen.vehicle.height_m, limit_m=safety.min_height_m)
+    height_m = seen.vehicle.height.m
+    if height_m + (margin if climb > 0 else 0.0) > safety.max_height_m:
+        return condition(_C.TOO_HIGH, height_m=height_m, limit_m=safety.max_height_m)
+    if (contradicted := contradicted_height(seen, lower=True)) is not None:
+        return contradicted
+    source, lowest = min(seen.heights.items(), key=lambda row: row[1].m, default=("unknown", seen.vehicle.height))
+    if not lowest.m - (margin if climb < 0 else 0.0) >= safety.min_height_m:
+        return condition(_C.TOO_LOW, height_m=lowest.m, source=source, limit_m=safety.min_height_m)
     if fence_centre is not None:
         offset = seen.vehicle.position[:2] - fence_centre
         distance = float(np.hypot(*offset))
         outward = max(float(offset @ seen.vehicle.velocity[:2]) / max(distance, 1e-6), 0.0)
         if distance + braking_distance(outward, safety) > safety.fence_radius_m:
             return condition(_C.AT_FENCE, distance_m=distance, limit_m=safety.fence_radius_m)
+    return None
+
+
+def contradicted_height(seen: Observed, *, lower: bool = False) -> Condition | None:
+    """Whether another source contradicts the reported height beyond what the two err by.
+
+    lower : by a lower one alone: a body that looks small for its posture seems to be farther below the camera
+    """
+    reported = seen.vehicle.height
+    for source, height in seen.heights.items():
+        surplus = (reported.m - height.m) / math.hypot(reported.sd_m, height.sd_m)
+        if (surplus if lower else abs(surplus)) > _SURE:
+            return condition(_C.HEIGHT_CONTRADICTED, height_m=reported.m, source=source, other_m=height.m)
     return None
 
 

@@ -14,8 +14,20 @@ from drocap_ros.flight.autopilot.autopilot import UNKNOWN
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.observed import Course, Health, Link, Mode, Motion, Observed, Pictures, SizeSight, Subject
+from drocap_ros.flight.observed import (
+    Course,
+    Health,
+    Height,
+    Link,
+    Mode,
+    Motion,
+    Observed,
+    Pictures,
+    SizeSight,
+    Subject,
+)
 from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
+from drocap_ros.flight.orbit.motion_checks import stalled_condition
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
@@ -41,6 +53,7 @@ class OwnFlight(NamedTuple):
     unsafe : why the setpoint of the last step was not sent
     intruder : another one that commands or is followed, found in the graph
     refusal : why the autopilot does not enter the requested mode, as a sentence; "" = it does not refuse
+    operator_age_s : since the last sign of the operator
     """
 
     orbiting_s: float = 0.0
@@ -49,6 +62,7 @@ class OwnFlight(NamedTuple):
     unsafe: Condition | None = None
     intruder: Condition | None = None
     refusal: str = ""
+    operator_age_s: float = math.inf
 
 
 class Observer:
@@ -146,11 +160,14 @@ class Observer:
             intruder=own.intruder,
             disturbance=disturbance,
             refusal=own.refusal,
+            operator_age_s=own.operator_age_s,
         )
-        if not observed.jumped and (stood_s := link.decision_age_s()) > config.watchdog_s:
-            # The process stood still within this step: what was read above belongs to different instants.
-            stalled = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
-            observed = dataclasses.replace(observed, disturbance=stalled)
+        # Within this step the process may have stood still too: what was read above belongs to different instants.
+        stood_s = max(dt, link.decision_age_s())
+        if before is not None and (own.hung or stood_s > config.watchdog_s):
+            observed = dataclasses.replace(observed, stalled_s=max(stood_s, config.watchdog_s))
+            if stood_s > max(config.watchdog_s, config.max_state_gap_s) and not observed.jumped:
+                observed = dataclasses.replace(observed, disturbance=stalled_condition(observed))
         return observed, dt
 
     def forget_changed_camera(self) -> None:
@@ -173,8 +190,6 @@ class Observer:
             return condition(ConditionCode.POSITION_JUMPED, jump_m=doubt.jump_m)
         if doubt.error_m_s > 0:
             return condition(ConditionCode.REPORTS_CONTRADICT, error_m_s=doubt.error_m_s)
-        if own.hung or dt > self._config.watchdog_s:
-            return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt)
         return self._camera_changed or own.unsafe
 
 
@@ -230,7 +245,8 @@ def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: Veh
             position=position,
             velocity=np.asarray(velocity, float),
             yaw=_yaw(vehicle),
-            height_m=float(position[2]) - config.ground_height_m,
+            height=Height(float(position[2]) - config.ground_height_m, config.height_error_m),
+            clearance_m=estimator.clearance_m(now_ns) * float(matrix_from_quaternion(vehicle.orientation_xyzw)[2, 2]),
             age_s=abs(age_s),
             position_age_s=position_age_s,
         ),
@@ -255,7 +271,7 @@ def _subject(estimate: SubjectEstimate, offset: np.ndarray, motion: Motion, by_s
         contradicted=estimate.contradicted or (by_size is not None and by_size.contradicted),
         sd_m=estimate.position_sd_m,
         nearer=estimate.nearer,
-        size_over_ground=estimate.size_over_ground,
+        ground=Height(estimate.ground.m + float(offset[2]), estimate.ground.sd_m),
         distance_m=distance if by_size is None else min(distance, by_size.farthest_m),
         closing_m_s=-float(sight @ motion.velocity[:2]) / max(distance, 1e-3),
         approach_m_s=float(sight @ estimate.velocity[:2]) / max(distance, 1e-3),

@@ -14,10 +14,8 @@ from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.hold import (
     begin_hold,
     foreign_mode,
-    is_silent,
     mode_visible,
     request_hold_mode,
-    resumption,
     retreat,
     stream_ended,
     update_hold,
@@ -53,7 +51,6 @@ from drocap_ros.flight.orbit.watchdog import GIVE_UP_S
 
 _C = ConditionCode
 _BLIND_MODE_REQUEST_S = 2.0  # of velocity zero, from 2.5 m/s at braking_m_s2: a brake by the mode takes longer
-_CLEAR_S = 1.0  # for which all conditions hold before an orbit resumes by itself
 _INTENTION_S = 2.0 / CURRENT_MODE_HZ  # two periods of CURRENT_MODE, which says what is intended
 
 
@@ -69,12 +66,10 @@ def reduce(
     -------
     The next state, and what may be sent until the step after it.
     """
-    vehicle = vehicle_condition(seen, limits)
-    place = None if vehicle else limit_condition(seen, _fence(state), limits)
-    problem = vehicle or place or subject_condition(seen, limits) or start_condition(seen)
     state = watch(state, seen, now_s, limits)
     sight = state.sight
     state = _by_mode(state, seen, now_s)
+    vehicle, place, problem = _problems(state, seen, limits)
     answer = None
     if command is not None:
         state, answer = _execute(state, seen, now_s, command, problem, limits)
@@ -86,9 +81,19 @@ def reduce(
         state = _wait(state, seen, now_s, problem, limits)
     elif isinstance(state, Holding) and not stream_ended(seen):
         state = update_hold(state, seen, now_s, vehicle is not None)
-        state = _hold(state, seen, now_s, problem, limits, astray=bool(vehicle or place))
+        moved = state if vehicle or place else retreat(state, seen, now_s, limits)
+        state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
     state = dataclasses.replace(state, sight=sight)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
+
+
+def _problems(
+    state: SafetyState, seen: Observed, limits: Limits
+) -> tuple[Condition | None, Condition | None, Condition | None]:
+    """Why vehicle and place forbid motion, and the first cause of all that no orbit may begin."""
+    vehicle = vehicle_condition(seen, limits)
+    place = None if vehicle else limit_condition(seen, _fence(state), limits)
+    return vehicle, place, vehicle or place or subject_condition(seen, limits) or start_condition(seen)
 
 
 def _fence(state: SafetyState) -> np.ndarray | None:
@@ -107,8 +112,9 @@ def _by_mode(state: SafetyState, seen: Observed, now_s: float) -> SafetyState:
     if not state.sight.lost and not seen.health.armed and seen.mode.name:
         return Idle(now_s, condition(_C.DISARMED))
     if seen.mode.in_hold:
-        # Once the autopilot holds, any other mode is somebody's choice.
-        return dataclasses.replace(state, modes=frozenset({seen.mode.name}))
+        # Once the autopilot holds, any other mode is somebody's choice, and the next orbit has a fence of its own.
+        fence = None if isinstance(state, Holding) else state.fence_centre
+        return dataclasses.replace(state, modes=frozenset({seen.mode.name}), fence_centre=fence)
     return state
 
 
@@ -126,6 +132,8 @@ def _returned(state: SafetyState, seen: Observed) -> bool:
 def _orbit(state: Orbiting, seen: Observed, now_s: float, blind: bool, limits: Limits) -> SafetyState:
     """Slow the orbit down by the age of the data, or end it."""
     problem = _ending(state, seen, limits) or keeping_condition(seen, limits)
+    if 0.0 < (limit_s := limits.safety.max_orbit_s) < now_s - state.since_s:
+        problem = problem or condition(_C.ORBIT_TIME_OVER, limit_s=limit_s)
     if problem:
         near = problem.code == _C.SUBJECT_NEAR
         return begin_hold(state, problem, seen, now_s, limits.safety.fence_radius_m, blind=blind, retreats=near)
@@ -137,19 +145,6 @@ def _orbit(state: Orbiting, seen: Observed, now_s: float, blind: bool, limits: L
     elif pace.value == 1.0:
         reason = condition(_C.ORBITING)
     return dataclasses.replace(state, pace=pace, condition=reason)
-
-
-def _hold(
-    state: Holding, seen: Observed, now_s: float, problem: Condition | None, limits: Limits, *, astray: bool
-) -> SafetyState:
-    """Retreat, hand over or resume; ``astray``: vehicle or place forbid motion."""
-    moved = state if astray else retreat(state, seen, now_s, limits)
-    state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
-    state = resumption(state, seen, now_s, problem, limits.safety)
-    clear = state.clear_s is not None and state.clear_s <= now_s - _CLEAR_S
-    if clear and seen.mode.in_control and not state.sight.lost:
-        return dataclasses.replace(_begin_orbit(seen, now_s), fence_centre=state.fence_centre)
-    return state
 
 
 def _ending(state: SafetyState, seen: Observed, limits: Limits) -> Condition | None:
@@ -189,6 +184,8 @@ def permit_mode(state: SafetyState, mode: str) -> SafetyState:
 def _execute(
     state: SafetyState, seen: Observed, now_s: float, command: Command, problem: Condition | None, limits: Limits
 ) -> tuple[SafetyState, CommandAnswer]:
+    if command == Command.PRESENT:
+        return state, _accepted(_C.NONE)
     state = dataclasses.replace(state, failed=None, asked_s=-math.inf) if isinstance(state, Idle) else state
     if command == Command.STOP:
         return _stop(state, seen, now_s, limits)
@@ -228,11 +225,11 @@ def _start_refusal(state: SafetyState, seen: Observed, problem: Condition | None
 
 def _request_refusal(seen: Observed, command: Command, limits: Limits) -> CommandAnswer | None:
     """Why control may not be requested from the autopilot."""
-    if command == Command.START:
-        return _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=by_hand(seen))
     if not limits.safety.mode_change_allowed:
         engaged = f" ({seen.autopilot.hints.engaged})" if seen.autopilot.hints.engaged else ""
         return _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode.name, engaged=engaged, by_hand=by_hand(seen))
+    if command == Command.START:
+        return _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=by_hand(seen))
     if seen.link.packet_loss > MAX_LOSS:
         return _refused(_C.PACKETS_LOST, lost_percent=100 * seen.link.packet_loss, most_percent=100 * MAX_LOSS)
     return None
@@ -248,7 +245,7 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
         answer = _accepted(_C.STOPPED if requested else _C.ACKNOWLEDGED)
         return Idle(now_s, answer.condition, asked_s=now_s if requested else -math.inf), answer
     if isinstance(state, Holding):
-        return dataclasses.replace(state, resumable=False), _accepted(_C.ALREADY_HOLDING)
+        return state, _accepted(_C.ALREADY_HOLDING)
     return state, _accepted(_C.NOT_ORBITING)
 
 
@@ -301,7 +298,8 @@ def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits)
         own_loss, warm = seen.mode.left_by_itself, now_s - state.since_s >= limits.warm_up_s
         wanted = warm and not own_loss and start_condition(seen) is None and mode_visible(state, seen, now_s, limits)
         return Action.HOLD, ModeRequest.CONTROL if wanted else ModeRequest.NONE
-    silent = not seen.mode.in_control or is_silent(state, now_s, limits) or stream_ended(seen)
+    unseen_s = 0.0 if state.sight.lost_s is None else now_s - state.sight.lost_s
+    silent = not seen.mode.in_control or unseen_s > limits.safety.blind_hold_s or stream_ended(seen)
     if isinstance(state, Holding) and not silent:
         return _permitted_in_hold(state, seen, now_s, limits)
     return Action.NOTHING, ModeRequest.NONE
@@ -336,16 +334,22 @@ def by_hand(seen: Observed) -> str:
     return f", or {seen.autopilot.hints.by_hand}" if seen.autopilot.hints.by_hand else ""
 
 
-def way_out(state: SafetyState, seen: Observed, *, mode_change_allowed: bool) -> str:
-    """What the operator may do next, as a sentence; "" = nothing leads out, or the condition says it."""
+def way_out(state: SafetyState, seen: Observed, limits: Limits) -> str:
+    """What the operator may do next, as a sentence; "" = nothing leads out, or the condition says it.
+
+    A command that it names is accepted now.
+    """
     if isinstance(state, TakenOver | Fault):
         return "`drocap orbit stop` acknowledges it, and nothing begins before"
     if not isinstance(state, Ready | Holding):
         return ""
-    if not seen.mode.in_control:
-        hand = by_hand(seen).removeprefix(", or ")
-        if mode_change_allowed:
-            return f"`drocap orbit engage` requests control and begins an orbit{by_hand(seen)}"
-        return f"{hand}, then `drocap orbit start`" if hand else "engage needs mode_change_allowed"
+    command = Command.START if seen.mode.in_control else Command.ENGAGE
+    refused = _start_refusal(state, seen, _problems(state, seen, limits)[2])
+    if refused is None and command == Command.ENGAGE:
+        refused = _request_refusal(seen, command, limits)
+    if refused is not None:
+        return "" if refused.condition.code == state.condition.code else str(refused.condition)
+    if command == Command.ENGAGE:
+        return f"`drocap orbit engage` requests control and begins an orbit{by_hand(seen)}"
     silent = isinstance(state, Holding) and stream_ended(seen)
     return ("nothing is sent any more; " if silent else "") + "`drocap orbit start` begins an orbit"

@@ -41,7 +41,7 @@ _FRAMED = (
     "there the fixed camera keeps one in the picture who walks up to the vehicle; a wider lens or a gimbal keeps him"
     " nearer"
 )
-_SURE_SIZES = 3.0  # of size_error, beyond which the picture contradicts the height
+_LEAST_SD_M = 0.05  # of a height
 #: m; no coast, the creep after its stop included, brings the vehicle by more nearer to the subject: 1 m is required of
 #: the bridge's death (benchmarks/flight_kills.py), and the prediction errs.
 _NEARER_M = 0.9
@@ -144,14 +144,16 @@ class FlownOrbit:
         )
 
     def _risen_m(self, seen: Observed) -> float:
-        """By how much (m) the subject's ground is surely higher below the vehicle than assumed: one never flies lower.
+        """By how much (m) the vehicle is lower above the subject's ground than reported: one never flies lower.
 
-        The range by the ground is too long in proportion where the reported height is too great, or the ground rises.
+        The mean of all heights counts by their variances; the lowest one keeps clear of the limit by itself.
         """
-        config, height_m = self._config, seen.vehicle.height_m
-        lower = (1.0 - _SURE_SIZES * config.size_error - seen.subject.size_over_ground) * height_m
-        room_m = config.max_height_m - HEIGHT_ROOM_M[1] - self.goal.height_m
-        return min(lower, max(room_m, 0.0)) if lower > 0.0 else 0.0  # NaN is not
+        config, goal_m, heights = self._config, self.goal.height_m, seen.heights.values()
+        metres, weights = np.array([h.m for h in heights]), np.array([max(h.sd_m, _LEAST_SD_M) ** -2 for h in heights])
+        reported, least_m = seen.vehicle.height.m, config.min_height_m + HEIGHT_ROOM_M[0]
+        lower = reported - float(weights @ metres / weights.sum())
+        lowest = reported - float(metres.min()) + least_m - goal_m
+        return min(max(lower, lowest, 0.0), max(config.max_height_m - HEIGHT_ROOM_M[1] - goal_m, 0.0))
 
 
 def _widened_condition(
@@ -262,7 +264,7 @@ def harmless(
     fence_centre : (2,) m; None = there is no fence
     """
     held, velocity = not seen.autopilot.continues_setpoints, complex(*seen.subject.velocity[:2])
-    longest_m, steady_m_s = seen.autopilot.coast.greatest * limits.safety.max_coast_m, coast_speed(seen, limits)
+    longest_m, steady_m_s = seen.autopilot.greatest_coast * limits.safety.max_coast_m, coast_speed(seen, limits)
     fastest_m_s = steady_m_s + _PULLED * (steady_m_s + abs(velocity)) if held else math.inf
     judge = _Coasting(seen, velocity, fence_centre, limits, longest_m, fastest_m_s)
     across_first = seen.subject.position is not None and (held or abs(velocity) > WALKING_M_S)

@@ -30,6 +30,7 @@ from drocap_ros.flight.orbit.motion_checks import (
     oldest_state_s,
     oldest_subject_s,
     outdated_condition,
+    stalled_condition,
 )
 from drocap_ros.flight.orbit.states import Limits, Pace
 from drocap_ros.flight.subject.guard import farness
@@ -68,7 +69,7 @@ def timeout_s(seen: Observed) -> float:
 def coast_speed(seen: Observed, limits: Limits) -> float:
     """Speed in m/s of a steady flight whose coast leaves room to ``max_coast_m``."""
     autopilot = seen.autopilot
-    return greatest_speed(autopilot, timeout_s(seen), autopilot.coast.steady * limits.safety.max_coast_m)
+    return greatest_speed(autopilot, timeout_s(seen), autopilot.steady_coast * limits.safety.max_coast_m)
 
 
 def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits: Limits) -> Condition:
@@ -124,37 +125,30 @@ def approach_speed(radius_m: float, chase_m_s: float, config: OrbitConfig) -> fl
 # -- by the age of the data -------------------------------------------------------------------------------------------
 
 
-class Allowed(NamedTuple):
-    """The pace that the data allow, 0 to 1, and the condition that reduces it."""
+def allowed_pace(seen: Observed, limits: Limits) -> tuple[float, Condition | None]:
+    """The pace that the data allow, 0 to 1, by the greatest of the ages relative to their limits, and what reduces it.
 
-    pace: float
-    cause: Condition | None
-
-
-def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
-    """The pace by the greatest age, relative to its limits, of subject, attitude, position and link."""
+    The ages are those of subject, attitude, position and link, and the stand of our own loop.
+    """
     safety = limits.safety
     usual_s = safety.max_state_age_s
     halt_s = 0.5 * (usual_s + oldest_state_s(safety, patient=True))
     subject_s = min(oldest_subject_s(seen, safety), _STANDING_AGE * safety.max_subject_age_s)
     usual_subject_s = min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s)
-    allowed = Allowed(1.0, None)
-    if seen.subject.contradicted:  # at once: most of what is flown after a jump is flown before the hold
-        allowed = Allowed(_LEAST_PACE, condition(_C.OTHER_SUBJECT, age_s=seen.subject.age_s))
-    pace = _share(seen.subject.age_s, usual_subject_s, subject_s)
-    if pace < allowed.pace:
-        allowed = Allowed(pace, outdated_condition(seen, usual_subject_s))
-    for age_s, code in (
+    ages = (
         (seen.link.age_s, _C.LINK_SILENT),
         (seen.vehicle.age_s, _C.ATTITUDE_OUTDATED),
         (seen.vehicle.position_age_s, _C.POSITION_FROZEN),
-    ):
-        pace = _share(age_s, usual_s, halt_s)
-        if pace < allowed.pace:
-            allowed = Allowed(pace, condition(code, age_s=age_s))
-    if allowed.cause is None:  # the reference waits by itself
-        allowed = allowed._replace(cause=keeping_condition(seen, limits, GUST_S))
-    return allowed
+    )
+    other = _LEAST_PACE if seen.subject.contradicted else 1.0  # at once: most is flown after a jump before the hold
+    pace, cause = min(
+        (other, condition(_C.OTHER_SUBJECT, age_s=seen.subject.age_s)),
+        (_share(seen.subject.age_s, usual_subject_s, subject_s), outdated_condition(seen, usual_subject_s)),
+        (_share(seen.stalled_s, 0.0, halt_s), stalled_condition(seen)),
+        *((_share(age_s, usual_s, halt_s), condition(code, age_s=age_s)) for age_s, code in ages),
+        key=lambda found: found[0],
+    )
+    return (pace, cause) if pace < 1.0 else (1.0, keeping_condition(seen, limits, GUST_S))  # the reference waits itself
 
 
 def _share(age_s: float, full_s: float, none_s: float) -> float:

@@ -31,6 +31,7 @@ class Command(enum.IntEnum):
     START = 1
     ADJUST = 2
     ENGAGE = 3
+    PRESENT = 16
 
 
 class Action(enum.Enum):
@@ -118,7 +119,7 @@ class SafetyState:
     @property
     def bound(self) -> bool:
         """Whether the vehicle flies, or may soon fly by itself, by the present subject: no other may replace it."""
-        return isinstance(self, Orbiting | Requesting) or (isinstance(self, Holding) and self.resumable)
+        return isinstance(self, Orbiting | Requesting)
 
 
 @dataclass(frozen=True)
@@ -191,9 +192,7 @@ class Holding(Commanding):
     retreated_s : when it last did
     slow_s : since when the vehicle has been slow; None = it is not
     hold_mode_s : when the autopilot's hold mode was first requested; None = not yet
-    resumable : whether the orbit may resume by itself: a harmless cause alone began the hold
     jumped_s : when the reported position has jumped last
-    clear_s : since when all conditions hold again where it is resumable; None = they do not
     """
 
     state = State.HOLDING
@@ -205,9 +204,7 @@ class Holding(Commanding):
     retreated_s: float = -math.inf
     slow_s: float | None = None
     hold_mode_s: float | None = None
-    resumable: bool = False
     jumped_s: float = -math.inf
-    clear_s: float | None = None
 
 
 @dataclass(frozen=True)

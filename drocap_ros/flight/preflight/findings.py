@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
@@ -77,23 +78,28 @@ Values = Mapping[str, float | str | bool]
 
 @dataclass(frozen=True)
 class Finding:
-    """One check.
+    """One check; :func:`check` and :meth:`named` give it its names.
 
-    code : of programs
-    name : of people
     found, wanted, remedy : sentences; "" where there is nothing to write
     values : measured values by names with their units; NaN = unknown
+    code : of programs
+    name : of people
     conditions : that this finding explains
     """
 
-    code: str
-    name: str
     level: Level
     found: str
     wanted: str = ""
     remedy: str = ""
     values: Values = field(default_factory=dict)
+    code: str = ""
+    name: str = ""
     conditions: tuple[ConditionCode, ...] = ()
+
+    def named(self, code: str, name: str, conditions: tuple[ConditionCode, ...] = ()) -> Finding:
+        """The finding of this name; the remedy of what is OK does not count."""
+        remedy = "" if self.level == Level.OK else self.remedy
+        return dataclasses.replace(self, code=code, name=name, conditions=conditions, remedy=remedy)
 
     def as_dict(self) -> dict[str, object]:
         """The finding for JSON, which has no NaN."""
@@ -102,28 +108,13 @@ class Finding:
         return {"code": self.code, "level": self.level.name.lower(), **words, "values": values}
 
 
-class Verdict(NamedTuple):
-    """Content of a finding; the remedy of what is OK does not count."""
-
-    level: Level
-    found: str
-    wanted: str = ""
-    remedy: str = ""
-    values: Values | None = None
-
-    def finding(self, code: str, name: str, conditions: tuple[ConditionCode, ...] = ()) -> Finding:
-        """The finding of this name."""
-        remedy = "" if self.level == Level.OK else self.remedy
-        return Finding(code, name, self.level, self.found, self.wanted, remedy, self.values or {}, conditions)
-
-
-def check(code: str, name: str, *conditions: ConditionCode) -> Callable[[Callable[P, Verdict]], Callable[P, Finding]]:
+def check(code: str, name: str, *conditions: ConditionCode) -> Callable[[Callable[P, Finding]], Callable[P, Finding]]:
     """Make a check of a function that judges."""
 
-    def made(judge: Callable[P, Verdict]) -> Callable[P, Finding]:
+    def made(judge: Callable[P, Finding]) -> Callable[P, Finding]:
         @functools.wraps(judge)
         def finding(*args: P.args, **keywords: P.kwargs) -> Finding:
-            return judge(*args, **keywords).finding(code, name, conditions)
+            return judge(*args, **keywords).named(code, name, conditions)
 
         return finding
 

@@ -12,7 +12,7 @@ from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.reports import MAX_LOSS
-from drocap_ros.flight.preflight.findings import Finding, Measured, Stream, Verdict, check, graded
+from drocap_ros.flight.preflight.findings import Finding, Measured, Stream, check, graded
 
 _C = ConditionCode
 _ENOUGH = 0.8  # share of a wanted rate: autopilots round intervals to their own loops
@@ -41,7 +41,7 @@ def link_findings(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[F
     for name, stream in measured.streams.items():
         if name != _MOUNT:  # the mount is a check of its own
             verdict, conditions = _rate(config, measured, name, stream)
-            yield verdict.finding(f"rate_{name.lower()}", f"rate of {name}", conditions)
+            yield verdict.named(f"rate_{name.lower()}", f"rate of {name}", conditions)
     if len(measured.delays_s):
         yield _delay(config, measured)
     # A bridge's own conditions watch how long an answer takes, and not whether there has ever been one.
@@ -52,22 +52,22 @@ def link_findings(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[F
 
 
 @check("link", "link")
-def _packets(measured: Measured) -> Verdict:
+def _packets(measured: Measured) -> Finding:
     share = measured.bad_count / max(measured.good_count + measured.bad_count, 1)
     values = {"messages": measured.good_count, "bad": measured.bad_count, "unsigned": measured.unsigned_count}
     found = measured.bridge or f"heard, {100 * share:.2g} % of the data is no MAVLink"
     wanted = "" if measured.bridge else f"at most {100 * _MOST_BAD:.0f} %"
     remedy = "check the baud rate and the wiring (ground, RX and TX)"
-    return Verdict(graded(warning=share > _MOST_BAD), found, wanted, remedy, values)
+    return Finding(graded(warning=share > _MOST_BAD), found, wanted, remedy, values)
 
 
 @check("packet_loss", "packets of the autopilot", _C.PACKETS_LOST)
-def _losses(measured: Measured) -> Verdict:
+def _losses(measured: Measured) -> Finding:
     lost = measured.packet_loss
     level = graded(missing=lost > MAX_LOSS, warning=lost > 0.5 * MAX_LOSS)
     wanted = f"below {100 * MAX_LOSS:.0f} %, above it no mode is requested"
     remedy = "let routers pass all packets of the autopilot, or mend the link"
-    return Verdict(level, f"{100 * lost:.0f} % lost", wanted, remedy, {"lost": lost})
+    return Finding(level, f"{100 * lost:.0f} % lost", wanted, remedy, {"lost": lost})
 
 
 #: Words of MAV_TYPE; others have their number.
@@ -75,22 +75,21 @@ _KINDS = {6: "ground station", 18: "companion computer", 26: "gimbal", 27: "ADS-
 
 
 @check("others", "who else is heard")
-def _others(measured: Measured) -> Verdict:
+def _others(measured: Measured) -> Finding:
     names = [f"{_KINDS.get(kind, f'type {kind}')} {at[0]}/{at[1]}" for at, kind in sorted(measured.others.items())]
-    values = {"others": ", ".join(names)}
-    return Verdict(graded(), values["others"], "", "", values)
+    return Finding(graded(), ", ".join(names), values={"others": ", ".join(names)})
 
 
 @check("vehicles", "vehicles on the link", _C.SEVERAL_VEHICLES)
-def _several(config: MavlinkBridgeConfig, measured: Measured) -> Verdict:
+def _several(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
     names = ", ".join(map(str, sorted(measured.systems)))
     level, remedy = graded(missing=not config.target_system_id), "set target_system_id to the system of your vehicle"
-    return Verdict(level, f"systems {names}", "one, or a chosen one", remedy, {"systems": names})
+    return Finding(level, f"systems {names}", "one, or a chosen one", remedy, {"systems": names})
 
 
 def _rate(
     config: MavlinkBridgeConfig, measured: Measured, name: str, stream: Stream
-) -> tuple[Verdict, tuple[ConditionCode, ...]]:
+) -> tuple[Finding, tuple[ConditionCode, ...]]:
     (limit_s, conditions), (real, wanted, gap_s) = _limit(config, name), stream
     found = f"{real:.1f} Hz" + (f", longest gap {gap_s:.2f} s" if real > 0 and math.isfinite(gap_s) else "")
     needed = f"{wanted:g} Hz, gaps below {limit_s:g} s" if limit_s else f"{wanted:g} Hz"
@@ -107,7 +106,7 @@ def _rate(
         found += f", refused with result {measured.refused[name]}"
         remedy = cause + "this autopilot grants no other rate"
     values = {"real_hz": real, "wanted_hz": wanted, "longest_gap_s": gap_s}
-    return Verdict(level, found, needed, remedy, values), conditions
+    return Finding(level, found, needed, remedy, values), conditions
 
 
 def _judged(stream: Stream, limit_s: float, *, short: bool) -> tuple[Level, str]:
@@ -126,35 +125,35 @@ def _limit(config: MavlinkBridgeConfig, name: str) -> tuple[float, tuple[Conditi
 
 
 @check("telemetry_delay", "delay of telemetry", _C.ATTITUDE_OUTDATED)
-def _delay(config: MavlinkBridgeConfig, measured: Measured) -> Verdict:
+def _delay(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
     typical, late = (float(v) for v in np.percentile(measured.delays_s, (50, 99)))
     limit = config.max_state_age_s
     level = graded(missing=late > limit, warning=late > 0.5 * limit)
     found, wanted = _spread(typical, late), f"below {_ms(0.5 * limit)} (max_state_age_s {limit:g})"
     remedy = f"stop what loads this computer, or: {_own_port(_autopilot(measured))}"
-    return Verdict(level, found, wanted, remedy, {"median_s": typical, "p99_s": late})
+    return Finding(level, found, wanted, remedy, {"median_s": typical, "p99_s": late})
 
 
 @check("round_trip", "round trip", _C.ROUND_TRIP_TOO_LONG)
-def _round_trip(config: MavlinkBridgeConfig, measured: Measured) -> Verdict:
+def _round_trip(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
     limit = config.max_round_trip_s
     if not len(measured.round_trips_s):
         remedy = (
             "connect TX of this computer too, let the router pass TIMESYNC, and set signing_key_file if the autopilot "
             "drops unsigned packets"
         )
-        return Verdict(Level.MISSING, "no answer to time synchronization", f"below {limit:g} s", remedy)
+        return Finding(Level.MISSING, "no answer to time synchronization", f"below {limit:g} s", remedy)
     typical, late = (float(v) for v in np.percentile(measured.round_trips_s, (50, 99)))
     period_s = 1.0 / config.time_sync_hz
     worst = late + period_s  # the condition counts from the sending of the message that was answered last
     level = graded(missing=worst > limit, warning=worst > 0.7 * limit)
     wanted = f"with the period of {period_s:g} s below {limit:g} s (max_round_trip_s)"
     values = {"median_s": typical, "p99_s": late}
-    return Verdict(level, _spread(typical, late), wanted, _own_port(_autopilot(measured)), values)
+    return Finding(level, _spread(typical, late), wanted, _own_port(_autopilot(measured)), values)
 
 
 @check("clock_offset", "clock of the autopilot")
-def _clock_offset(measured: Measured) -> Verdict:
+def _clock_offset(measured: Measured) -> Finding:
     # The exchanges with the shortest round trips are the sure ones: the rest adds its queueing.
     chosen = np.flatnonzero(measured.round_trips_s <= np.percentile(measured.round_trips_s, 50))
     sure = measured.offsets_s[chosen]
@@ -166,7 +165,7 @@ def _clock_offset(measured: Measured) -> Verdict:
         "lower the load of the link"
     )
     level = graded(warning=spread > _MOST_SPREAD_S)
-    return Verdict(level, f"offset steady to {_ms(spread)}", f"to {_ms(_MOST_SPREAD_S)}", remedy, values)
+    return Finding(level, f"offset steady to {_ms(spread)}", f"to {_ms(_MOST_SPREAD_S)}", remedy, values)
 
 
 def _own_port(autopilot: Autopilot) -> str:

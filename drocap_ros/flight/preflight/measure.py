@@ -23,7 +23,7 @@ from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import start_condition, vehicle_condition
 from drocap_ros.flight.orbit.observer import observe_vehicle
 from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.preflight.findings import LASTING, Finding, Measured, Stream, Verdict, check, graded
+from drocap_ros.flight.preflight.findings import LASTING, Finding, Measured, Stream, check, graded
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
 from drocap_ros.flight.preflight.vehicle_checks import vehicle_findings
@@ -193,8 +193,7 @@ def version_text(number: int) -> str:
 
 
 def _stream(arrivals: list[int], from_ns: int, now_ns: int, wanted_hz: float) -> Stream:
-    recent = [at for at in arrivals if at >= from_ns]
-    seconds = (now_ns - from_ns) / NS
+    recent, seconds = [at for at in arrivals if at >= from_ns], (now_ns - from_ns) / NS
     if seconds <= 0:
         return Stream(math.nan, wanted_hz)
     gap_s = max(np.diff([from_ns, *recent, now_ns])) / NS
@@ -224,18 +223,18 @@ def is_ready(found: Sequence[Finding]) -> bool:
 
 def _unexplained(failed: Condition, share: float) -> Finding:
     level, words = graded(missing=share > LASTING, warning=True), f"{failed} ({share:.0%} of the time)"
-    verdict = Verdict(level, words, "none that fails", "see docs/flight.md, conditions for motion", {"share": share})
-    return verdict.finding(f"condition_{failed.code.name.lower()}", "condition for motion", (failed.code,))
+    verdict = Finding(level, words, "none that fails", "see docs/flight.md, conditions for motion", {"share": share})
+    return verdict.named(f"condition_{failed.code.name.lower()}", "condition for motion", (failed.code,))
 
 
 @check("vehicle", "vehicle")
-def _no_attitude() -> Verdict:
+def _no_attitude() -> Finding:
     remedy = "wait until the autopilot has started; check that it may send ATTITUDE_QUATERNION"
-    return Verdict(Level.MISSING, "no attitude", "attitude and position", remedy)
+    return Finding(Level.MISSING, "no attitude", "attitude and position", remedy)
 
 
 @check("link", "link")
-def _silence(config: MavlinkBridgeConfig, measured: Measured) -> Verdict:
+def _silence(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
     data, remedy = "nothing", "check the cable, the power and the URL"
     if measured.unsigned_count:
         data = f"{measured.unsigned_count} messages that are not signed with the key of signing_key_file"
@@ -247,4 +246,4 @@ def _silence(config: MavlinkBridgeConfig, measured: Measured) -> Verdict:
         remedy += f", and target_system_id {config.target_system_id}"
     found = f"{data} {measured.bridge or f'on {config.url}'}"
     values = {"bad": measured.bad_count, "unsigned": measured.unsigned_count}
-    return Verdict(Level.MISSING, found, "an autopilot's heartbeat", remedy, values)
+    return Finding(Level.MISSING, found, "an autopilot's heartbeat", remedy, values)

@@ -13,7 +13,7 @@ from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig, goal_of
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.observed import Motion
-from drocap_ros.flight.preflight.findings import Finding, Values, Verdict, check, graded
+from drocap_ros.flight.preflight.findings import Finding, Values, check, graded
 from drocap_ros.flight.subject.framing import Framing, View, orbit_margin
 from drocap_ros.flight.vehicle import VehicleState
 
@@ -96,14 +96,14 @@ def setup_findings(config: MavlinkBridgeConfig, setup: Setup, vehicle: VehicleSt
 
 
 @check("commands_enabled", "permission to fly", _C.COMMANDS_DISABLED)
-def _permission(config: MavlinkBridgeConfig) -> Verdict:
+def _permission(config: MavlinkBridgeConfig) -> Finding:
     found = f"commands_enabled is {str(config.commands_enabled).lower()}"
     remedy = "set commands_enabled to true when you have read docs/flight.md"
-    return Verdict(graded(missing=not config.commands_enabled), found, "true", remedy)
+    return Finding(graded(missing=not config.commands_enabled), found, "true", remedy)
 
 
 @check("limits", "limits")
-def _limits(config: MavlinkBridgeConfig) -> Verdict:
+def _limits(config: MavlinkBridgeConfig) -> Finding:
     """Limits that are allowed one by one and hinder each other."""
     speed = abs(math.radians(config.angular_speed_deg_s)) * config.radius_m
     words, remedies = [f"orbit of {config.radius_m:g} m, {config.height_m:g} m high, {speed:.1f} m/s"], []
@@ -122,25 +122,25 @@ def _limits(config: MavlinkBridgeConfig) -> Verdict:
         )
         remedies.append("raise blind_hold_s, or lower max_speed_m_s")
     level, wanted = graded(warning=bool(remedies)), "limits that leave room for each other"
-    return Verdict(level, "; ".join(words), wanted, "; ".join(remedies), {"speed_m_s": speed, "room_m": room})
+    return Finding(level, "; ".join(words), wanted, "; ".join(remedies), {"speed_m_s": speed, "room_m": room})
 
 
 @check("perception", "pictures and networks", _C.NO_SUBJECT)
-def _source(setup: Setup) -> Verdict:
+def _source(setup: Setup) -> Finding:
     remedies = [] if setup.source else ["set image_ingest.source to the camera"]
     remedies += [] if setup.models else [setup.models_remedy]
     found = f"{setup.source or 'no source'}, {'networks in ' + setup.models if setup.models else 'no networks'}"
     values = {"source": setup.source, "models": setup.models}
     wanted = "a camera, a detector and a pose network"
-    return Verdict(graded(missing=bool(remedies)), found, wanted, "; ".join(remedies), values)
+    return Finding(graded(missing=bool(remedies)), found, wanted, "; ".join(remedies), values)
 
 
 @check("images", "images", _C.NO_SUBJECT)
-def _opened(setup: Setup, pictures: Pictures) -> Verdict:
+def _opened(setup: Setup, pictures: Pictures) -> Finding:
     """Whether the source gives images as it is asked to."""
     wanted = "images"
     if pictures.refusal:
-        return Verdict(Level.MISSING, "not opened", wanted, pictures.refusal, {"opened": False})
+        return Finding(Level.MISSING, "not opened", wanted, pictures.refusal, {"opened": False})
     (width, height), remedies = pictures.size, []
     words = [f"{width}x{height} px"]
     words += [f"{pictures.rate_hz:.3g} images/s"] if math.isfinite(pictures.rate_hz) else ["one image, then no more"]
@@ -158,37 +158,37 @@ def _opened(setup: Setup, pictures: Pictures) -> Verdict:
         "opened": True, "width_px": width, "height_px": height, "rate_hz": pictures.rate_hz,
         "latency_s": pictures.latency_s,
     }  # fmt: skip
-    return Verdict(graded(warning=bool(remedies)), ", ".join(words), wanted, "; ".join(remedies), values)
+    return Finding(graded(warning=bool(remedies)), ", ".join(words), wanted, "; ".join(remedies), values)
 
 
 @check("camera", "camera", _C.NO_CAMERA_INFO)
-def _camera(setup: Setup) -> Verdict:
+def _camera(setup: Setup) -> Finding:
     if setup.camera_matrix is None:
         remedy = "set image_ingest.calibration_file (ROS camera_calibration), or at least horizontal_fov_deg"
-        return Verdict(Level.MISSING, setup.camera_words, "a calibration, or a field of view", remedy)
+        return Finding(Level.MISSING, setup.camera_words, "a calibration, or a field of view", remedy)
     remedy = "calibrate and set image_ingest.calibration_file: an error of the field of view is one of the range"
     values = {"fov_deg": math.degrees(2 * math.atan(0.5 * setup.image_size[0] / float(setup.camera_matrix[0, 0])))}
-    return Verdict(graded(warning=not setup.calibrated), setup.camera_words, "a calibration", remedy, values)
+    return Finding(graded(warning=not setup.calibrated), setup.camera_words, "a calibration", remedy, values)
 
 
 @check("camera_latency", "camera latency")
-def _latency(config: MavlinkBridgeConfig, setup: Setup) -> Verdict:
+def _latency(config: MavlinkBridgeConfig, setup: Setup) -> Finding:
     """Whether the stamps of the pictures are the driver's; how late they are cannot be seen from here."""
     driver, stated_s = setup.source.startswith(DRIVER), config.camera_latency_s
     stamps = f"stamps are {'' if driver else 'not '}the driver's"
     values: Values = {"source": setup.source, "camera_latency_s": stated_s}
     if stated_s > 0:
-        return Verdict(Level.OK, f"{stated_s:g} s as stated; {stamps}", "measured or stated", values=values)
+        return Finding(Level.OK, f"{stated_s:g} s as stated; {stamps}", "measured or stated", values=values)
     aside_deg = abs(config.angular_speed_deg_s) * _STREAM_DELAY_S
     remedy = (
         f"use a camera on {DRIVER}N, or a topic with stamps of the exposure, or measure the delay and set "
         f"camera_latency_s: {_STREAM_DELAY_S:g} s late, a picture has the person {aside_deg:.1f} deg aside"
     )
-    return Verdict(graded(warning=not driver), f"not stated; {stamps}", "stamps of the exposure", remedy, values)
+    return Finding(graded(warning=not driver), f"not stated; {stamps}", "stamps of the exposure", remedy, values)
 
 
 @check("picture", "person in the picture", _C.PERSON_LEAVES_PICTURE)
-def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehicle: VehicleState | None) -> Verdict:
+def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehicle: VehicleState | None) -> Finding:
     """Whether the person fits into the picture, and how high it is there."""
     rows = setup.image_size[1]
     framing = Framing(config)
@@ -213,7 +213,7 @@ def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehi
         remedies.append("fly closer, or raise width_px and height_px")
     found = f"{fit.height_px:.0f} px high, rows {fit.head_px:.0f} to {fit.feet_px:.0f} of {rows} ({how})"
     values = {**fit._asdict(), "rows": rows, "pitch_deg": pitch_deg}
-    return Verdict(level, found, f"inside the picture, {_GOOD_PX:.0f} px high", "; ".join(remedies), values)
+    return Finding(level, found, f"inside the picture, {_GOOD_PX:.0f} px high", "; ".join(remedies), values)
 
 
 def _unaimed_camera(
@@ -269,7 +269,7 @@ def best_pitch_deg(config: MavlinkBridgeConfig) -> float:
 
 
 @check("body_height", "body height")
-def _body(config: MavlinkBridgeConfig, setup: Setup) -> Verdict:
+def _body(config: MavlinkBridgeConfig, setup: Setup) -> Finding:
     measured = config.size_error <= _MEASURED_SIZE_ERROR
     remedies = []
     if not measured:
@@ -281,4 +281,4 @@ def _body(config: MavlinkBridgeConfig, setup: Setup) -> Verdict:
     words = "measured" if measured else "assumed"
     found = f"{config.body_height_m:g} m, {words} (size_error {config.size_error:g})"
     values = {"body_height_m": config.body_height_m, "size_error": config.size_error}
-    return Verdict(graded(warning=bool(remedies)), found, "measured", "; ".join(remedies), values)
+    return Finding(graded(warning=bool(remedies)), found, "measured", "; ".join(remedies), values)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from drocap_ros.flight.bridge_config import SubjectConfig
+from drocap_ros.flight.observed import NO_HEIGHT, Height
 from drocap_ros.flight.subject.guard import Parallax
 from drocap_ros.flight.subject.subject_measurement import MAX_BENDING, SubjectMeasurement, locate_subject
 from drocap_ros.flight.vehicle import CameraPose
@@ -17,11 +19,12 @@ from drocap_ros.stamps import NS
 STANDING_M_S = 0.3  # speed that the estimate of one who stands has
 WALKING_M_S = 0.5  # least speed of one who walks
 _DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are set down; no motion of the subject
-_RATIO_MEMORY_NS = 4 * NS  # of size over ground: several strides
-_LEAST_RATIOS = 15  # images: a second of them
-_RATIO_QUANTILE = 0.4  # a little less than the median: bending makes the body look smaller
-_WANDERING_MEMORY_NS = 1 * NS  # where the height wanders: recorded ones change by 0.1 m within it, 4 % of the range
-_WANDERING_RATIOS = 8  # images: half a second of them
+#: Memory of the ground by the body, and least images: several strides and a second; where the reported height wanders,
+#: a second, within which recorded ones change by 0.1 m, and half of one.
+_MEMORY, _WANDERING = (4 * NS, 15), (1 * NS, 8)
+_QUANTILE = (
+    0.6  # of the ground's height, a little more than the median: bending makes the body look smaller, so farther
+)
 _NEARER_S = 1.0  # filter of what the two ranges disagree by
 _MAX_SURPRISE = 0.3  # share of the range, beyond which the gate decides
 #: (6, 6): a place and a velocity that stay, and by the second what the velocity adds to the place.
@@ -38,7 +41,7 @@ class SubjectEstimate:
     age_s : since then
     contradicted : whether an image since then showed another track, or a subject where this one cannot be
     nearer : share of his distance from the camera by which the nearer of body size and ground puts him nearer
-    size_over_ground : ratio of these two ranges over the last seconds; NaN = unknown
+    ground : his ground by his body alone, over the last seconds
     """
 
     position: np.ndarray
@@ -50,7 +53,7 @@ class SubjectEstimate:
     track_id: int
     contradicted: bool = False
     nearer: float = 0.0
-    size_over_ground: float = float("nan")
+    ground: Height = NO_HEIGHT
 
 
 def _range_noise(
@@ -87,7 +90,7 @@ class SubjectFilter:
         self._stamp_ns = 0
         self._track_id = 0
         self._contradicted = False
-        self._ratio, self._ratios = float("nan"), deque[tuple[int, float]]()
+        self._ground, self._grounds = NO_HEIGHT, deque[tuple[int, float]]()
         self._nearer = 0.0
         self._parallax = Parallax(config.size_error)
 
@@ -105,7 +108,7 @@ class SubjectFilter:
         """
         if camera is None:
             return False
-        measured = locate_subject(observation, camera_matrix, camera, self._config, self._ratio)
+        measured = locate_subject(observation, camera_matrix, camera, self._config, self._ground)
         if measured is None:
             return False
         sight = measured.position - camera.position
@@ -131,7 +134,7 @@ class SubjectFilter:
         self._systematic = measurement.systematic
         self._stamp_ns, self._contradicted = observation.stamp_ns, False
         self._nearer += (measurement.nearer - self._nearer) * min(gap_s / _NEARER_S, 1.0)
-        self._learn_ratio(measurement, observation.stamp_ns)
+        self._learn_ground(measurement, observation.stamp_ns)
         if float(np.hypot(*self._state[3:5])) > WALKING_M_S:
             self._parallax.forget()
         else:
@@ -163,25 +166,24 @@ class SubjectFilter:
             track_id=self._track_id,
             contradicted=self._contradicted,
             nearer=self._nearer,
-            size_over_ground=self._ratio,
+            ground=self._ground,
         )
 
-    def _learn_ratio(self, measurement: SubjectMeasurement, stamp_ns: int) -> None:
-        """Ratio of the two ranges over the last seconds.
+    def _learn_ground(self, measurement: SubjectMeasurement, stamp_ns: int) -> None:
+        """His ground by his body over the last seconds.
 
-        Bending makes the body look smaller, never larger, so unequal bones do not count, and a little less than the
+        Bending makes the body look smaller, never larger, so unequal bones do not count, and a little more than the
         median does.  A quantile does not follow a few wrong images, the first ones least of all.
         """
-        ratio = measurement.range_size_m / measurement.range_ground_m
-        if 0.5 < ratio < 2.0 and measurement.bending < MAX_BENDING:  # NaN is not
-            self._ratios.append((stamp_ns, ratio))
-        memory_ns, least = _RATIO_MEMORY_NS, _LEAST_RATIOS
-        if self.height_wanders:
-            memory_ns, least = _WANDERING_MEMORY_NS, _WANDERING_RATIOS
-        while self._ratios and stamp_ns - self._ratios[0][0] > memory_ns:
-            self._ratios.popleft()
-        if len(self._ratios) >= least:
-            self._ratio = float(np.quantile([ratio for _, ratio in self._ratios], _RATIO_QUANTILE))
+        if math.isfinite(measurement.ground.m) and measurement.bending < MAX_BENDING:  # NaN is not
+            self._grounds.append((stamp_ns, measurement.ground.m))
+        memory_ns, least = _WANDERING if self.height_wanders else _MEMORY
+        while self._grounds and stamp_ns - self._grounds[0][0] > memory_ns:
+            self._grounds.popleft()
+        if len(self._grounds) >= least:
+            height_m = float(np.quantile([height for _, height in self._grounds], _QUANTILE))
+            sd_m = measurement.ground.sd_m
+            self._ground = Height(height_m, sd_m if math.isfinite(sd_m) else self._ground.sd_m)
 
     def _start(self, observation: PoseObservation, measurement: SubjectMeasurement) -> None:
         self._state = np.concatenate([measurement.position, np.zeros(3)])
@@ -189,12 +191,12 @@ class SubjectFilter:
         self._covariance[:3, :3] = measurement.noise
         self._systematic, self._nearer = measurement.systematic, measurement.nearer
         if observation.track_id != self._track_id:  # another person
-            self._ratios.clear()
-            self._ratio = float("nan")
+            self._grounds.clear()
+            self._ground = NO_HEIGHT
             self._parallax = Parallax(self._config.size_error)
         self._stamp_ns, self._track_id = observation.stamp_ns, observation.track_id
         self._contradicted = False
-        self._learn_ratio(measurement, observation.stamp_ns)
+        self._learn_ground(measurement, observation.stamp_ns)
 
     def _predicted(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         assert self._state is not None

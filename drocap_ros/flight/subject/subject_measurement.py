@@ -6,8 +6,8 @@ intersection of the rays through the ankles with level ground.  Both have system
 attitude), which the measurement carries apart from its noise.
 
 The two ranges disagree by their assumptions, which are constant, and by posture, which passes and only makes the body
-look smaller, so farther.  So the ground gives the range of each image, and the ratio of the two over some seconds, see
-``subject_filter.py``, the correction by body size.
+look smaller, so farther.  So the feet give the range of each image, and body size over some seconds, see
+``subject_filter.py``, the ground on which they stand: it is as far below the camera as they appear at that range.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.bridge_config import SubjectConfig
+from drocap_ros.flight.observed import NO_HEIGHT, Height
 from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.skeleton import BODY_15, joint_map
@@ -36,6 +37,8 @@ _ANKLES = np.array([BODY_15.index("rankle"), BODY_15.index("lankle")])
 _TRUNK = np.array([BODY_15.index(name) for name in ("pelvis", "rhip", "lhip", "neck")])
 _NECK = BODY_15.index("neck")
 _ANKLE_HEIGHT = 0.055  # share of the stature; a swinging foot lifts the mean a little
+_LOWEST = 0.1  # of the assumed height, at which a range by the ground still means something
+_PELVIS_HEIGHT = 0.53  # share of the stature (Winter), standing
 _CONFIDENCE = 0.25  # below it a joint counts as not seen
 _STEEP = np.sin(np.deg2rad(75.0))
 _SHALLOW = np.sin(np.deg2rad(4.0))
@@ -54,6 +57,7 @@ class _Noise(NamedTuple):
     apart : of the distance between the feet
     stride_m : of the mean of the feet about the pelvis
     lean_rad : of the body; looking down by a slope it changes lengths by as much
+    feet_m, pelvis_m : of the ground, by feet of which one is lifted, and by the pelvis of one who may crouch
     """
 
     ground: float = 0.025
@@ -62,6 +66,8 @@ class _Noise(NamedTuple):
     apart: float = 0.1
     stride_m: float = 0.15
     lean_rad: float = 0.12
+    feet_m: float = 0.1
+    pelvis_m: float = 0.3
 
 
 _NOISE = _Noise()
@@ -77,6 +83,7 @@ class SubjectMeasurement(NamedTuple):
     bending : foreshortening of unequal bones, logarithm of a ratio; about 0.1 by noise alone; inf = the trunk alone,
         of a person whose legs are out of the picture
     nearer : share of the range by which the nearer of the two sources puts the subject nearer; 0 with one source
+    ground : his ground by body size and bearing, which know nothing of any height
     """
 
     position: np.ndarray
@@ -86,6 +93,7 @@ class SubjectMeasurement(NamedTuple):
     range_ground_m: float
     bending: float
     nearer: float = 0.0
+    ground: Height = NO_HEIGHT
 
 
 def locate_subject(
@@ -93,15 +101,15 @@ def locate_subject(
     camera_matrix: np.ndarray,
     camera: CameraPose,
     config: SubjectConfig,
-    size_over_ground: float = float("nan"),
+    known: Height = NO_HEIGHT,
 ) -> SubjectMeasurement | None:
     """Locate the subject in one image.
 
     observation : keypoints of any joint set that maps to ``BODY_15``
     camera_matrix : (3, 3) px
     camera : pose at the stamp of the observation
-    size_over_ground : ratio of the two ranges over the last seconds; NaN = that of this image.  It changes slowly by
-        the assumptions, and quickly when the subject crouches: then the ground is right
+    known : his ground by his body over the last seconds; unknown = that of this image.  It changes slowly by the
+        assumptions, and quickly when the subject crouches: then the feet on it are right
 
     Returns
     -------
@@ -129,7 +137,9 @@ def locate_subject(
     size, bending = _range_from_size(rays, seen, pelvis[:2] / flat, config)
     size_error = float(np.hypot(config.size_error, _NOISE.lean_rad * slope))
     ground, height, noise = _range_from_ground(rays, seen, camera.position, config)
-    steady = size_over_ground * ground if np.isfinite(size_over_ground) and np.isfinite(ground) else size
+    steady = size
+    if np.isfinite(known.m) and np.isfinite(ground):  # the feet on the known ground
+        steady = ground * max(1.0 - (known.m - config.ground_height_m) / height, _LOWEST)
     distance, sd = _fuse(steady, size_error, ground, _ground_sd(ground, height, config))
     if _contradict(steady, size_error, ground, height, config):
         # On another ground than assumed the ratio changes with the camera's height: the size of this image counts.
@@ -155,9 +165,9 @@ def locate_subject(
     # Feet give a precise range from image to image, bones do not.
     if not np.isfinite(noise):
         noise = (BENT if np.isinf(bending) else 1.0) * SIZE_NOISE * distance + 0.05
-    return SubjectMeasurement(
-        position, spread(noise, _NOISE.bearing * distance + 0.03), spread(sd, turn), size, ground, bending, nearer
-    )
+    across = _NOISE.bearing * distance + 0.03
+    level = _ground_by_body(size, size_error, rays, seen, camera.position, config)
+    return SubjectMeasurement(position, spread(noise, across), spread(sd, turn), size, ground, bending, nearer, level)
 
 
 def _range_from_size(
@@ -207,6 +217,24 @@ def _range_from_ground(
     distance = nearer if lifted else float(ranges.mean())
     noise = _NOISE.ground * distance + 0.05 + _NOISE.apart * min(apart, 0.5 * nearer)
     return distance, height, noise
+
+
+def _ground_by_body(
+    size: float, size_error: float, rays: np.ndarray, seen: np.ndarray, position: np.ndarray, config: SubjectConfig
+) -> Height:
+    """The ground below the body, which is seen at this range by its size: as far below the camera as its feet appear.
+
+    It needs no ground plane, and holds where feet appear at the horizon or above it: of a camera as low as they are.
+    """
+    joints, above, sd = _ANKLES[seen[_ANKLES]], _ANKLE_HEIGHT, _NOISE.feet_m
+    if len(joints) == 0:
+        joints, above, sd = _TRUNK[:1][seen[_TRUNK[:1]]], _PELVIS_HEIGHT, _NOISE.pelvis_m
+    if len(joints) == 0 or not np.isfinite(size):
+        return NO_HEIGHT
+    slope = float((rays[joints, 2] / np.maximum(np.hypot(rays[joints, 0], rays[joints, 1]), 1e-6)).mean())
+    turn = np.deg2rad(config.attitude_error_deg) * (1.0 + slope**2) * size
+    height = float(position[2]) + size * slope - above * config.body_height_m
+    return Height(height, float(np.linalg.norm([size_error * size * slope, turn, sd])))
 
 
 def _ground_sd(distance: float, height: float, config: SubjectConfig) -> float:

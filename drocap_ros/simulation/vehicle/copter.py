@@ -80,7 +80,8 @@ class SimulatedCopter(ReportingCopter):
         lost = by == _LOST and self.simulated.critical_when_lost
         self.system_status = mavlink.MAV_STATE_CRITICAL if lost else mavlink.MAV_STATE_ACTIVE
         manner = manner_of(self.kind, mode)
-        self.control.begin(manner, self.estimate, self.body.velocity + self.error.velocity, self.body.yaw)
+        yaw = self.body.yaw + self.error.yaw
+        self.control.begin(manner, self.estimate, self.body.velocity + self.error.velocity, yaw)
         if mode in _CLIMB_M_S:
             self.control.target.position = None
             self.control.target.velocity = np.array([0.0, 0.0, _CLIMB_M_S[mode]])
@@ -102,7 +103,7 @@ class SimulatedCopter(ReportingCopter):
                 self.motion_until_s = self._t
         speed = self.body.velocity + self.error.velocity
         command = self.control.command(self.estimate, speed, expired, dt)
-        self.body.step(command, self.control.yaw_rate(self.body.yaw), dt)
+        self.body.step(command, self.control.yaw_rate(self.body.yaw + self.error.yaw), dt)
 
     def _failsafes(self) -> None:
         if self.simulated.lost_modes:

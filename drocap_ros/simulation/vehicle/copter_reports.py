@@ -19,18 +19,21 @@ from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
 
 _STEP_S = 0.1  # of the fitted processes; between their steps the errors are interpolated
 _SETTLED = 600  # steps from zero: several times the longest correlation, 13 s
+_YAW_WANDERS_S = 20.0  # within 10 to 60 s: recorded
 _DEAD_RECKONING_M_S = np.array([0.15, 0.075, 0.0])  # drift without satellites
 
 
 class EstimateError:
     """Error of the estimated position and velocity, ENU, stepped in time; ``share`` of the recorded size, 0 = none.
 
-    ``glitch`` may be changed: (3,) m that the autopilot accepted, and keeps.
+    ``glitch`` may be changed: (3,) m that the autopilot accepted, and keeps; so may ``yaw_sd``, of its heading ``yaw``.
     """
 
     def __init__(self, horizontal: ReportErrors, vertical: ReportErrors, share: float, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 0xC0])
         self.glitch: np.ndarray = np.zeros(3)
+        self.yaw = self.yaw_sd = 0.0  # rad
+        self._yaw_rng = np.random.default_rng([seed, 0xC3])
         axes = (horizontal, horizontal, vertical)
         self._first, self._second = (np.array(rows) for rows in zip(*((a.first, a.second) for a in axes), strict=True))
         self._noise = share * np.array([axis.noise for axis in axes])
@@ -61,6 +64,9 @@ class EstimateError:
         self._between = (1.0 - self._part) * self._before + self._part * self._now
         if dead_reckoning:
             self.glitch = self.glitch + _DEAD_RECKONING_M_S * dt
+        share = math.exp(-dt / _YAW_WANDERS_S)
+        push = float(self._yaw_rng.standard_normal()) if self.yaw_sd else 0.0
+        self.yaw = share * self.yaw + self.yaw_sd * math.sqrt(1.0 - share**2) * push
 
     def _advance(self) -> None:
         """One step of the processes, by sums in a fixed order: the same bits wherever the arrays lie in memory."""
@@ -165,6 +171,7 @@ class CopterSetup(NamedTuple):
 
     wind : (3,) m/s
     estimate_error : of the estimate, as a share of the recorded ones
+    yaw_error_deg : standard deviation of the heading's error, which wanders within 20 s; PX4's was 4 to 19 at worst
     timeout_s : its own time-out without setpoints
     mode : at first; "" = that of the sticks
     mount : of the camera; None = a gimbal, level
@@ -176,6 +183,7 @@ class CopterSetup(NamedTuple):
     seed: int = 0
     estimate_error: float = 1.0
     attitude_error_deg: float = 0.4
+    yaw_error_deg: float = 0.0
     timeout_s: float = 0.5
     mode: str = "LOITER"
     mount: SimulatedMount | None = None
@@ -203,6 +211,7 @@ class ReportingCopter(SimulatedVehicle):
         # The estimate of the body leans wrongly by as much as that of a gimbal.
         lean = np.array([*(0.5 * self._attitude_error[:2]), 0.0, 1.0])
         self._lean_error = lean / np.linalg.norm(lean)
+        self.error.yaw_sd = math.radians(setup.yaw_error_deg)
         self._report: VehiclePose | None = None
         self._report_s = -1.0
 
@@ -229,10 +238,11 @@ class ReportingCopter(SimulatedVehicle):
             return self._report
         self._report_s = t_s
         body = self.body.orientation_xyzw()
+        turn = np.array([0.0, 0.0, math.sin(0.5 * self.error.yaw), math.cos(0.5 * self.error.yaw)])
         self._report = VehiclePose(
             self.estimate,
             self.body.velocity + self.error.velocity,
-            quaternion_multiply(body, self._lean_error),
+            quaternion_multiply(quaternion_multiply(turn, body), self._lean_error),
             np.array([0.0, 0.0, self.body.yaw_rate]),
             self.mount.camera(body),
         )

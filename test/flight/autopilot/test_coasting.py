@@ -77,3 +77,15 @@ def test_a_place_far_ahead_lengthens_the_coast_of_px4():
     near, far = (Setpoint(np.array([way, 0.0, 0.0]), velocity, zero, 0.0, 0.0) for way in (0.4, 1.4))
     lengths = [autopilot_of("px4").coast_of(last, zero, velocity, 0.5).length_m for last in (near, far)]
     assert lengths[1] > lengths[0] + 0.5
+
+
+@pytest.mark.parametrize("push", [(0.6, 0.0), (0.0, 0.8), (0.3, -0.5)])
+def test_until_the_time_out_ardupilot_flies_on_along_the_parabola_of_its_setpoint(push):
+    velocity, zero = np.array([1.2, 0.3, 0.0]), np.zeros(3)
+    last = Setpoint(zero, velocity, np.array([*push, 0.0]), 0.0, 0.0)
+    how = autopilot_of("ardupilot").coasting
+    coast = autopilot_of("ardupilot").coast_of(last, zero, velocity, 0.5)
+    for t, place in zip(coast.time_s, coast.place, strict=True):
+        if t <= 0.5:
+            flown = complex(*velocity[:2]) * t + 0.5 * complex(*push) * t**2
+            assert abs(place - how.excess * flown) < 0.02

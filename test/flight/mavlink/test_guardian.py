@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import select
 import signal
 import socket
@@ -237,4 +238,18 @@ def test_a_port_that_is_gone_does_not_stop_the_bridge(pipe):
     guardian.take([b"hold"], CONTROL, pipe[1])
     guardian.take([b"hold"], CONTROL, gone)
     guardian.take([], CONTROL, gone)
+    guardian.close()
+
+
+def test_a_guardian_without_an_order_waits_without_looking():
+    guardian = GuardianProcess(0.2)
+
+    def switches():
+        """How often it has gone to sleep."""
+        status = Path(f"/proc/{child()}/status").read_text()
+        return int(re.search(r"^voluntary_ctxt_switches:\s*(\d+)", status, re.MULTILINE)[1])
+
+    before = -1
+    while before != (before := switches()):  # until it has started
+        time.sleep(0.5)
     guardian.close()

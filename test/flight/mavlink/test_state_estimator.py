@@ -85,6 +85,23 @@ def test_position_is_enu_and_extrapolated_to_the_attitude(ready):
     assert np.allclose(state.velocity_enu_m_s, [0, 10, 0])
 
 
+def test_only_a_fresh_range_finder_that_looks_down_and_is_in_range_tells_the_clearance(ready):
+    estimator, sender = ready
+    down, ahead = mavlink.MAV_SENSOR_ROTATION_PITCH_270, mavlink.MAV_SENSOR_ROTATION_NONE
+
+    def clearance(centimetres, orientation, age_s=0.1):
+        message = sender("distance_sensor", 1000, 20, 4000, centimetres, 0, 1, orientation, 255)
+        estimator.update(message, 10 * S)
+        return estimator.clearance_m(10 * S + int(age_s * S))
+
+    assert math.isnan(estimator.clearance_m(10 * S))
+    assert clearance(250, down) == 2.5
+    assert clearance(900, ahead) == 2.5
+    assert math.isnan(clearance(250, down, age_s=1.5))
+    assert math.isnan(clearance(4000, down))
+    assert math.isnan(clearance(10, down))
+
+
 def test_old_position_is_unknown(ready):
     estimator, sender = ready
     estimator.update(sender("local_position_ned", 1000, 1, 2, -3, 1, 0, 0), 10 * S)

@@ -1,6 +1,8 @@
 """The room to stop in before the subject: own speed and chase count together."""
 
+import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.bridge_config import SafetyConfig
 from drocap_ros.flight.conditions import ConditionCode, condition
+from drocap_ros.flight.observed import Height
 from drocap_ros.flight.orbit.motion_checks import battery_condition, stopping_room, subject_condition
-from drocap_ros.flight.orbit.safety import permit_mode, reduce, way_out
+from drocap_ros.flight.orbit.safety import by_hand, permit_mode, reduce, way_out
 from drocap_ros.flight.orbit.states import (
     Action,
     Command,
@@ -49,6 +52,9 @@ BAD = {
     "too high": {"height_m": 21.0},
     "climbing to the limit": {"height_m": 18.5, "velocity": np.array([0, 0, 2.5])},
     "too low": {"height_m": 1.0},
+    "low by a range finder": {"clearance_m": 1.1},
+    "low by the image": {"ground": Height(1.4, 0.2)},
+    "height contradicted": {"ground": Height(-3.0, 0.2), "height_m": 6.0, "position": np.array([6.0, 0, 1.0])},
     "subject none": {"subject": None},
     "subject old": {"subject_age_s": 1.1},
     "subject from the future": {"subject_age_s": -1.0},
@@ -82,6 +88,9 @@ CODES = {
     "too high": ConditionCode.TOO_HIGH,
     "climbing to the limit": ConditionCode.TOO_HIGH,
     "too low": ConditionCode.TOO_LOW,
+    "low by a range finder": ConditionCode.TOO_LOW,
+    "low by the image": ConditionCode.TOO_LOW,
+    "height contradicted": ConditionCode.HEIGHT_CONTRADICTED,
     "subject none": ConditionCode.NO_SUBJECT,
     "subject old": ConditionCode.SUBJECT_OUTDATED,
     "subject from the future": ConditionCode.SUBJECT_OUTDATED,
@@ -263,15 +272,43 @@ def test_why_an_engage_ended_without_an_orbit_stays_until_the_next_command():
     ],
 )
 def test_a_state_says_what_leads_out(state, seen, words):
-    found = way_out(state, seen, mode_change_allowed=True)
+    found = way_out(state, seen, LIMITS)
     assert found.startswith(words)
     assert bool(found) == bool(words)
 
 
 def test_without_the_permission_to_change_the_mode_the_pilot_or_the_configuration_leads_out():
-    assert way_out(Ready(), LOITER, mode_change_allowed=False).endswith("then `drocap orbit start`")
-    px4 = changed(LOITER, autopilot="px4")
-    assert "mode_change_allowed" in way_out(Ready(), px4, mode_change_allowed=False)
+    forbidden = LIMITS._replace(safety=SafetyConfig(commands_enabled=True))
+    for seen in (LOITER, changed(LOITER, autopilot="px4")):
+        found = way_out(Ready(), seen, forbidden)
+        assert "set it to true" in found
+        assert found.endswith(by_hand(seen))
+
+
+@pytest.mark.parametrize(
+    "state", [Ready(), Holding(), TakenOver(), Fault(), Idle()], ids=lambda state: state.state.name
+)
+@pytest.mark.parametrize("name", [None, *BAD])
+@pytest.mark.parametrize("mode", [GOOD, LOITER, BRAKE, changed(LOITER, packet_loss=0.4)])
+def test_a_command_that_the_way_out_names_is_accepted(state, name, mode):
+    if isinstance(state, Holding):
+        state = dataclasses.replace(state, modes=frozenset({mode.mode.name}), fence_centre=np.array([50.0, 0.0]))
+    seen = bad(name, mode) if name else mode
+    state = reduce(state, seen, 0.0, None, LIMITS)[0]
+    named = re.search("`drocap orbit ([a-z]+)`", way_out(state, seen, LIMITS))
+    if named is not None:
+        answer = reduce(state, seen, 0.1, Command[named[1].upper()], LIMITS)[1].answer
+        assert answer.accepted, (way_out(state, seen, LIMITS), str(answer))
+
+
+def test_after_a_hold_at_the_fence_the_next_orbit_has_a_fence_of_its_own():
+    far = np.array([50.0, 0.0])  # from the vehicle
+    held = Holding(0.0, condition(ConditionCode.AT_FENCE), modes=frozenset({"GUIDED", "BRAKE"}), fence_centre=far)
+    assert refusal(reduce(held, GOOD, 0.0, Command.START, LIMITS)[1]) == ConditionCode.AT_FENCE
+    assert way_out(held, GOOD, LIMITS) == ""  # the condition says it
+    state, decision = reduce(held, BRAKE, 0.0, Command.ENGAGE, LIMITS)
+    assert decision.answer.accepted
+    assert np.abs(reduce(state, GOOD, 0.1, None, LIMITS)[0].fence_centre - far).max() > 10.0
 
 
 def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():
@@ -574,3 +611,11 @@ def test_where_the_speed_decides_the_words_of_a_near_subject_name_its_share():
     room_m = float(words.split("the last ")[1].split(" m")[0])
     assert "7.1 m away" in words
     assert 7.1 - room_m < 3.0
+
+
+def test_a_body_that_seems_small_forbids_a_start_and_ends_no_orbit():
+    crouching = changed(GOOD, ground=Height(-2.0, 0.3))  # 4.5 m by the image, 2.5 m as reported
+    _, decision = reduce(Idle(), crouching, 0.0, Command.START, LIMITS)
+    assert decision.answer.condition.code == ConditionCode.HEIGHT_CONTRADICTED
+    state, _ = reduce(orbiting(), crouching, 1.0, None, LIMITS)
+    assert state.state == State.ORBITING

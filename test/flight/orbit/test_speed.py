@@ -12,7 +12,6 @@ from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.speed import allowed_pace, next_pace, slowed
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, Pace, State
 
-RESUMING = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, resume_after_hold_s=6.0))
 OLD = {
     "late picture": {"subject_age_s": 1.1},
     "attitude": {"state_age_s": 0.5},
@@ -42,26 +41,26 @@ def fly(state, observed, seconds, start_s, limits=LIMITS, command=None):
 
 @pytest.mark.parametrize("name", ["subject_age_s", "link_age_s", "state_age_s", "position_age_s"])
 def test_pace_falls_with_every_age_from_one_to_zero(name):
-    paces = [allowed_pace(seen(**{name: age_s}), LIMITS).pace for age_s in np.arange(0.0, 0.5, 0.01)]
+    paces = [allowed_pace(seen(**{name: age_s}), LIMITS)[0] for age_s in np.arange(0.0, 0.5, 0.01)]
     assert paces[:20] == [1.0] * 20
     assert paces == sorted(paces, reverse=True)
     assert paces[-9] == 0.0  # 0.41 s
     assert len(set(paces)) > 8
-    assert allowed_pace(seen(**{name: 0.28}), LIMITS).cause is not None
+    assert allowed_pace(seen(**{name: 0.28}), LIMITS)[1] is not None
 
 
 def test_pace_ends_sooner_at_speed():
     fast = seen(subject_age_s=0.3, velocity=np.array([0.0, 3.4, 0.0]))
-    assert allowed_pace(fast, LIMITS).pace == 0.0
-    assert 0.2 < allowed_pace(changed(fast, velocity=np.zeros(3)), LIMITS).pace < 0.5
+    assert allowed_pace(fast, LIMITS)[0] == 0.0
+    assert 0.2 < allowed_pace(changed(fast, velocity=np.zeros(3)), LIMITS)[0] < 0.5
 
 
 def test_usual_age_is_flown_at_full_speed_and_setpoints_stand_before_a_third_of_a_second():
-    assert allowed_pace(seen(subject_age_s=0.17 + 1 / 15), LIMITS).pace == 1.0
-    assert allowed_pace(seen(subject_age_s=0.32), LIMITS).pace > 0.0
-    assert allowed_pace(seen(subject_age_s=0.335), LIMITS).pace == 0.0
+    assert allowed_pace(seen(subject_age_s=0.17 + 1 / 15), LIMITS)[0] == 1.0
+    assert allowed_pace(seen(subject_age_s=0.32), LIMITS)[0] > 0.0
+    assert allowed_pace(seen(subject_age_s=0.335), LIMITS)[0] == 0.0
     slow_network = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, max_subject_age_s=1.2))
-    assert allowed_pace(seen(subject_age_s=0.5, velocity=np.zeros(3)), slow_network).pace > 0.5
+    assert allowed_pace(seen(subject_age_s=0.5, velocity=np.zeros(3)), slow_network)[0] > 0.5
 
 
 def test_orbit_slows_down_for_a_late_picture_and_goes_on_from_the_speed_that_is_left():
@@ -123,7 +122,7 @@ def test_hold_after_a_stand_keeps_the_standing_place():
 def test_orbit_ends_beyond_the_longest_gap_and_never_resumes_by_itself(name):
     state, _ = reduce(orbiting(), seen(**OLD[name]), 1.0, None, LIMITS)
     assert state.state == State.HOLDING
-    state, actions = fly(state, GOOD, 2.0, 1.05)
+    state, actions = fly(state, GOOD, 9.0, 1.05)
     assert set(actions) == {Action.HOLD}
 
 
@@ -141,51 +140,6 @@ def test_start_needs_what_an_orbit_at_full_speed_needs(name):
     state, decision = reduce(state, seen(**values), 1.3, Command.START, LIMITS)
     assert state.state == State.HOLDING
     assert not decision.answer.accepted
-
-
-@pytest.mark.parametrize("name", OLD)
-def test_orbit_resumes_after_a_short_hold_where_the_operator_allows_it(name):
-    state, _ = reduce(orbiting(), seen(**OLD[name]), 1.0, None, RESUMING)
-    centre = state.fence_centre
-    state, actions = fly(state, seen(**OLD[name]), 2.0, 1.05, RESUMING)
-    assert set(actions) == {Action.HOLD}
-    state, actions = fly(state, seen(subject=np.array([1.0, 0.0, 0.0])), 1.2, 3.05, RESUMING)
-    assert state.state == State.ORBITING
-    assert 19 <= actions.index(Action.ORBIT) <= 22  # all conditions have held for a second
-    assert np.array_equal(state.fence_centre, centre)  # the fence stays where it was
-
-
-@pytest.mark.parametrize("name", NOT_HARMLESS)
-def test_orbit_resumes_after_no_other_cause(name):
-    for first in (NOT_HARMLESS[name], OLD["attitude"]):  # at once, or during the hold
-        state, _ = reduce(orbiting(), seen(**first), 1.0, None, RESUMING)
-        assert state.state == State.HOLDING
-        state, _ = reduce(state, seen(**NOT_HARMLESS[name]), 1.05, None, RESUMING)
-        state, actions = fly(state, GOOD, 4.0, 1.1, RESUMING)
-        assert Action.ORBIT not in actions
-
-
-def test_orbit_does_not_resume_after_a_stop_nor_late_nor_in_another_mode():
-    held, _ = reduce(orbiting(), seen(**OLD["late picture"]), 1.0, None, RESUMING)
-    _, decision = reduce(held, GOOD, 1.05, Command.STOP, RESUMING)
-    assert decision.answer.accepted
-    _, actions = fly(held, GOOD, 4.0, 1.05, RESUMING, Command.STOP)
-    assert Action.ORBIT not in actions
-    late, _ = fly(held, seen(**OLD["late picture"]), 6.2, 1.05, RESUMING)
-    assert Action.ORBIT not in fly(late, GOOD, 4.0, 7.3, RESUMING)[1]
-    for other in (LOITER, BRAKE):
-        assert Action.ORBIT not in fly(held, other, 4.0, 1.05, RESUMING)[1]
-
-
-def test_hold_mode_is_requested_after_the_time_for_resuming():
-    old = seen(**OLD["late picture"])
-    state, _ = reduce(orbiting(), old, 1.0, None, RESUMING)
-    requests = []
-    for i in range(160):
-        state, decision = reduce(state, old, 1.05 + 0.05 * i, None, RESUMING)
-        requests.append(decision.mode_request)
-    first_s = 0.05 * requests.index(ModeRequest.HOLD)
-    assert 5.9 < first_s < 7.5
 
 
 def in_hold_mode():

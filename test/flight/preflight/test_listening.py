@@ -105,6 +105,7 @@ def test_with_the_file_that_the_ground_station_loads_nothing_is_missing_and_noth
     found = {code: finding for code, finding in scene.findings.items() if finding.level >= Level.WARNING}
     assert found == {}, found
     assert {name.lower() for name in judged} & scene.findings.keys()
+    assert ("one who walks" in scene.findings["autopilot"].found) == (autopilot == "px4")
     assert scene.findings["fence"].found == "60 m wide, 30 m high"
 
 
@@ -257,6 +258,13 @@ def test_health_of_the_vehicle(autopilot):
     scene = Scene(autopilot, before=ill, seconds=10.0)
     assert {"satellites", "estimator", "battery"} <= scene.missing()
     assert scene.findings["battery"].found.startswith("12 %")
+
+
+def test_an_origin_that_is_not_where_the_vehicle_stands_is_named():
+    found = Scene("px4", dataclasses.replace(CONFIG, ground_height_m=-2.8)).findings["ground_height_m"]
+    assert found.level == Level.WARNING
+    assert found.values["stands_m"] == pytest.approx(0.0, abs=0.4)
+    assert Scene("px4").findings["ground_height_m"].level == Level.OK
 
 
 def test_a_battery_monitor_without_a_charge_is_named():

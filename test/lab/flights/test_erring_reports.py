@@ -62,7 +62,7 @@ def test_simulated_reports_err_as_much_as_the_recorded_ones(shared, autopilot):
 def test_a_height_that_is_reported_too_great_brings_nobody_down(autopilot):
     """Feet and body of the picture contradict it: by the reports alone the vehicle flew at 1.3 and 0.1 m."""
     settings = LoopSettings(autopilot=autopilot, seed=1, seconds=24.0, distance_m=7.0)
-    loop = OrbitLoop(with_config(settings, body_height_m=settings.stature_m, size_error=0.04))
+    loop = OrbitLoop(with_config(settings, body_height_m=settings.stature_m, size_error=0.04, height_error_m=1.0))
     loop.copter.error.glitch = np.array([0.0, 0.0, 1.2])  # and what wanders beside it
     loop.start()
     loop.run(22.0)

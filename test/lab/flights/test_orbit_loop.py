@@ -63,6 +63,39 @@ def test_same_flight_is_bit_identical():
     assert np.array_equal(*ends)
 
 
+def test_an_orbit_ends_at_its_longest_time_and_starts_again():
+    loop = OrbitLoop(with_config(LoopSettings(seconds=30), max_orbit_s=5.0))
+    loop.start()
+    loop.run(15.0)
+    held_s, state, condition = loop.reasons[-1]
+    assert (state, condition.code) == ("HOLDING", ConditionCode.ORBIT_TIME_OVER)
+    assert 9.0 <= held_s < 9.2
+    loop.command(Command.ENGAGE)
+    loop.run(17.0)
+    assert loop.controller.safety.state == State.ORBITING
+
+
+@pytest.mark.parametrize("late_s", [0.0, 5.0])
+def test_without_a_sign_of_the_operator_no_orbit_begins_and_one_that_is_flown_holds(late_s):
+    loop = OrbitLoop(with_config(LoopSettings(seconds=30), operator_timeout_s=1.5))
+    loop.start()
+    loop.run(4.5)
+    assert loop.answers[-1][1].condition.code == ConditionCode.OPERATOR_SILENT
+
+    def sign(loop):
+        stamp_ns = loop.clock_ns() - round(late_s * 1e9)
+        loop.controller.command(OperatorCommand(int(Command.PRESENT), stamp_ns=stamp_ns))
+
+    loop.run(6.0, sign)
+    loop.command(Command.START)
+    loop.run(10.0, sign)
+    assert loop.controller.safety.state == (State.IDLE if late_s else State.ORBITING)  # an old sign is none
+    loop.run(12.0)
+    held_s, _, condition = loop.reasons[-1]
+    assert condition.code == ConditionCode.OPERATOR_SILENT
+    assert late_s or 11.4 <= held_s <= 11.6
+
+
 def test_engage_without_permission_is_refused_and_no_setpoint_is_sent():
     settings = LoopSettings(seconds=8, start_mode="LOITER")
     loop = OrbitLoop(with_config(settings, mode_change_allowed=False))

@@ -239,3 +239,12 @@ def swapped(data, words, rng):
     for _ in range(rng.randrange(1, 5)):
         parts[rng.randrange(len(parts))] = rng.choice(words)
     return b",".join(parts)
+
+
+def test_a_last_number_below_zero_is_a_depth_and_no_score(tmp_path):
+    points = walk()
+    depths = np.concatenate([points[..., :2], np.linspace(-0.4, 0.6, 17)[:, None].repeat(12, 1).T[..., None]], axis=2)
+    folder = [{"frame": i, "keypoints": rows(frame)} for i, frame in enumerate(depths)]
+    tracks = read_keypoints(write(tmp_path / "pose.json", folder))
+    assert np.isfinite(tracks.keypoints).all()
+    assert (tracks.confidence == 1.0).all()

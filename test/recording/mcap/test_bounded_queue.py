@@ -51,3 +51,18 @@ def test_take_waits_for_a_message_and_returns_when_closed():
     thread.join(5)
     assert got[1] is None
     assert not queue.put(message("pose"), image=False)
+
+
+def test_each_dropped_message_is_counted_once():
+    queue = BoundedQueue(800)
+    put = [queue.put(message("image", 100, i), image=True) for i in range(9)]
+    put += [queue.put(message("pose", 300, i), image=False) for i in range(4)]
+    assert queue.put(message("late", 1, -1), image=False) is False
+    taken = 0
+    while queue.take(0) is not None:
+        taken += 1
+    assert taken + queue.drop_count() == len(put) + 1
+    queue.put(message("pose", 10), image=False)
+    queue.drop_all()
+    queue.drop_all()
+    assert taken + queue.drop_count() == len(put) + 2
