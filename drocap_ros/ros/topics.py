@@ -82,7 +82,7 @@ class NodeEntry(NamedTuple):
 
     source : the node is activated when all other nodes are ready, and may end by itself
     live : ``drocap live`` starts the node by default
-    niceness : Unix niceness of its process.  The flight loop has 0, and what is short and upstream of the long work
+    niceness : Unix niceness of its process.  The flight loop has 0, and what leads from a picture to its initial pose
     """
 
     publishes: tuple[str, ...] = ()
@@ -96,7 +96,7 @@ class NodeEntry(NamedTuple):
 NODES: dict[str, NodeEntry] = {
     "image_ingest": NodeEntry(("image/compressed", "camera_info"), source=True, live=True),
     "flight_simulator": NodeEntry(("image/compressed", "camera_info"), source=True),
-    "pose_estimator": NodeEntry(("pose2d", "background"), ("image/compressed", "roi"), live=True, niceness=3),
+    "pose_estimator": NodeEntry(("pose2d", "background"), ("image/compressed", "roi"), live=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(
         ("pose3d/refined", "pose3d/latest", *_TF),
