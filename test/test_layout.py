@@ -30,7 +30,7 @@ BUDGETS = {
      "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "live_replay"): 4.00,  # what a live graph published came from recording
     ("perception",): 6.64,  # one who is followed live, everybody in a recording; fewer points where there is no time
-    ("reconstruction",): 12.68,  # one engine and one camera; several recordings; the live core came from nodes (0.1)
+    ("reconstruction",): 12.70,  # one engine and one camera; several recordings; the live core came from nodes (0.1)
     ("flight",): 9.25,  # a process that holds after the bridge's death; preflight; heights by every source
     ("recording",): 5.10,  # every format of telemetry and of keypoints stayed; damaged and foreign recordings
     ("simulation",): 3.45,  # reports err as recorded ones

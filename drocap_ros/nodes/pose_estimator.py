@@ -8,6 +8,7 @@ image's header.
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -20,7 +21,7 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.recording.image_messages import image_from_message
-from drocap_ros.ros.component import OK, WARN, ComponentNode, Gaps, MessageInfo
+from drocap_ros.ros.component import OK, WARN, ComponentNode, Gaps, Line, MessageInfo
 from drocap_ros.ros.conversions import background_to_ros, pose2d_to_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.lifecycle import ManagedComponent
@@ -28,7 +29,7 @@ from drocap_ros.ros.own_process import LoadShedding, LookAhead
 from drocap_ros.ros.topics import IMAGE_IN_GRAPH_QOS, publishers_of, subscribers_of
 
 _TOPIC = "image/compressed"
-_DEPTH = 2  # images that may wait
+_DEPTH = 4  # images that may wait
 
 
 class ImageSample(NamedTuple):
@@ -48,14 +49,13 @@ class ImageSample(NamedTuple):
 class ImageQueue:
     """Images between the thread that receives and the thread that processes: the newest ``depth``.
 
-    A camera that was held up sends two at once, which both count.  Where two wait again after that, this machine is too
-    slow, and the newest is taken.
+    Those that have waited too long are passed over (:class:`Line`).  ``clock`` : ns, that of the receptions
     """
 
-    def __init__(self, depth: int) -> None:
-        self._images: deque[CompressedImage] = deque(maxlen=depth)
-        self._missed = 0
-        self._behind = False
+    def __init__(self, depth: int, clock: Callable[[], int] = time.time_ns) -> None:
+        self._images: deque[tuple[CompressedImage, int]] = deque(maxlen=depth)
+        self._clock, self._line = clock, Line(periods=1.0)
+        self._missed = self._begin_ns = 0
         self._busy = False
         self._closed = False
         self._changed = threading.Condition()
@@ -64,25 +64,27 @@ class ImageQueue:
         """Append an image; ``missed`` images before it were lost elsewhere."""
         with self._changed:
             self._missed += missed + (len(self._images) == self._images.maxlen)
-            self._images.append(message)
+            self._images.append((message, self._clock()))
             self._changed.notify_all()
 
     def take(self) -> ImageSample | None:
         """Next image; None at the end.  The image taken before is then done."""
         with self._changed:
+            if self._busy:
+                self._line.took((self._clock() - self._begin_ns) * 1e-9)
             self._busy = False
             self._changed.notify_all()
             waited = bool(self._images)
             self._changed.wait_for(lambda: self._images or self._closed)
             if self._closed:
                 return None
-            self._busy = True
-            while self._behind and len(self._images) > 1:
-                self._images.popleft()
+            self._busy, self._begin_ns = True, self._clock()
+            message, received_ns = self._images.popleft()
+            while self._line.passes_over({"received_timestamp": received_ns}, self._begin_ns) and self._images:
+                message, received_ns = self._images.popleft()
                 self._missed += 1
-            self._behind = len(self._images) > 1
             missed, self._missed = self._missed, 0
-            return ImageSample(self._images.popleft(), missed, waited, len(self._images))
+            return ImageSample(message, missed, waited, len(self._images))
 
     def wait_idle(self, timeout_s: float) -> bool:
         """Wait until no image waits or is processed; returns whether that was reached."""

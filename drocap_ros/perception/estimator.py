@@ -98,7 +98,7 @@ class PoseEstimator:
             after each run of the pose network; a detection has one window, no second pass, and after a clear pose
             an interval of ``load_level * detect_every_s``; after a run of the pose network without a person it pauses
             for ``load_level`` images, doubled at each further failure up to four times that, unless the detection is
-            clear; the scene's points are followed ten times a second
+            clear; from 2 on the scene's points are followed ten times a second
         ahead : the next image, whose scene another thread follows meanwhile; the results are the same without it
         """
         _check_image(image)
@@ -110,7 +110,7 @@ class PoseEstimator:
             self._margins, self._certain, self._seen_ns = None, None, 0
         self._last_ns = stamp_ns
         roi = _validated_roi(roi)
-        scene = self._scene_of(image, stamp_ns, ahead, seldom=load_level > 0)
+        scene = self._scene_of(image, stamp_ns, ahead, seldom=load_level > 1)
         # A camera that repeats its picture shows nothing new: the bridge knows that by the same keypoints, bit for bit.
         if scene.again and self._certain is not None and roi is None:
             observation = dataclasses.replace(self._certain, stamp_ns=stamp_ns)

@@ -7,7 +7,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
-from statistics import median
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -38,7 +37,7 @@ _CLOCK_STANDS_S = 5.0
 #: Between looks for a publisher that keeps its last message.
 _KEPT_PERIOD_S = 0.5
 #: Where a node is too slow, a message that has waited longer than this is passed over: more than two images at 30 Hz.
-_LONGEST_WAIT_S = 0.08
+_LONGEST_WAIT_S = 0.07
 #: After a pause of the machine a node that is fast enough works off what has waited for less than this.
 _LONGEST_PAUSE_S = 1.0
 #: Then all are passed over that have waited longer than this share of it: up to the newest.
@@ -65,21 +64,25 @@ class Gaps:
 class Line:
     """Tells of messages that are passed over where a node takes longer for one than it takes the next to come.
 
-    Those that have waited too long are, up to the newest; what takes longer than an image may let messages wait for two
-    of its periods.
+    Those that have waited too long are, up to the newest.
+
+    periods : of the node's own work that a message may wait
     """
 
-    def __init__(self) -> None:
+    def __init__(self, periods: float = 2.0) -> None:
         self.behind = False
+        self._periods = periods
         self._last_ns = 0
-        self._took_s: deque[float] = deque([0.0], maxlen=3)  # of which the median is no pause of the machine
+        self._took_s: deque[float] = deque(maxlen=8)
 
     def passes_over(self, info: MessageInfo, now_ns: int) -> bool:
         """Whether this message is passed over, by the time since the middleware received it."""
         received_ns = info["received_timestamp"] or now_ns
         since_last_s, self._last_ns = (received_ns - self._last_ns) * 1e-9, received_ns
-        waited_s, took_s = (now_ns - received_ns) * 1e-9, median(self._took_s)
-        limit_s = max(2.0 * took_s, _LONGEST_WAIT_S)
+        # The longest may be a pause of the machine.
+        took_s = (sum(self._took_s) - max(self._took_s, default=0.0)) / max(len(self._took_s) - 1, 1)
+        waited_s = (now_ns - received_ns) * 1e-9
+        limit_s = max(self._periods * took_s, _LONGEST_WAIT_S)
         if self.behind:
             self.behind = waited_s > _CAUGHT_UP * limit_s
         else:

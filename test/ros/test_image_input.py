@@ -85,18 +85,6 @@ def test_full_queue_drops_the_oldest_image_and_counts_it():
     assert queue.wait_idle(timeout_s=0.0)
 
 
-def test_two_that_come_at_once_both_count_and_where_two_wait_again_the_newest_is_taken():
-    queue, images = ImageQueue(depth=2), numbered(7)
-    for image in images[:2]:
-        queue.put(image)
-    assert queue.take() == (images[0], 0, True, 1)
-    queue.put(images[2])
-    assert queue.take() == (images[2], 1, True, 0)
-    queue.put(images[3])
-    queue.put(images[4])
-    assert queue.take() == (images[3], 0, True, 1)
-
-
 def test_image_that_did_not_wait_is_marked_so():
     queue, (image,) = ImageQueue(depth=2), numbered(1)
     threading.Timer(0.1, queue.put, [image]).start()

@@ -9,6 +9,7 @@ import pytest
 from live_stream import observed
 from walking import stamps
 
+from drocap_ros.background import Background
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StreamEvent
 
@@ -56,6 +57,22 @@ def test_every_nth_frame_is_counted_from_the_newest() -> None:
     part = buffer.window().every(3)
     np.testing.assert_array_equal(part.stamp_ns, stamps(10)[[0, 3, 6, 9]])
     assert part.keypoints.xy.shape == (4, 17, 2)
+
+
+def test_frames_near_those_with_fixed_points_are_left_out() -> None:
+    buffer = FrameBuffer(ADJUSTER)
+    for o in observed(10):
+        buffer.push(o, JOINTS)
+    seldom, always = (
+        Background(frames, np.arange(len(frames)), np.zeros((len(frames), 2), np.float32))
+        for frames in (np.array([1, 4, 7], np.int32), np.arange(10, dtype=np.int32))
+    )
+    part = buffer.window()._replace(background=seldom).every(2)
+    np.testing.assert_array_equal(part.stamp_ns, stamps(10)[[1, 4, 7, 9]])
+    assert part.background is not None
+    np.testing.assert_array_equal(part.background.frame, [0, 1, 2])
+    part = buffer.window()._replace(background=always).every(3)
+    np.testing.assert_array_equal(part.stamp_ns, stamps(10)[[0, 3, 6, 9]])
 
 
 def test_memory_is_bounded_at_any_frame_rate() -> None:

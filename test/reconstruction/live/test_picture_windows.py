@@ -179,6 +179,20 @@ def test_a_path_behind_a_pause_of_the_points_begins_where_the_person_has_gone_me
     assert abs(turned_deg(across(body), across(after[0]))) < 20.0
 
 
+def test_points_that_a_busy_machine_follows_in_every_second_image_give_the_path_too() -> None:
+    true = flown()
+    seldom = true.background.frame % 2 == 0
+    some = Background(true.background.frame[seldom], true.background.track[seldom], true.background.point[seldom])
+    brief = replace(true, observations=true.observations[: round(6.0 * FPS)])
+    there = [
+        w for w in windows(brief, lambda stamps: some.of_frames(np.searchsorted(true.stamp_ns, stamps)))
+        if w.in_map is not None
+    ]  # fmt: skip
+    assert len(there) >= 2
+    place = np.searchsorted(true.stamp_ns, there[-1].stamp_ns)
+    assert world_errors(there[-1].joints3d.astype(float), true.truth[place], FPS / 2).wa_mm < 100.0
+
+
 def test_without_texture_there_is_no_path_and_the_poses_stay_with_the_camera() -> None:
     true = flown()
     brief = replace(true, observations=true.observations[: round(5.0 * FPS)])
