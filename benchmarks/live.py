@@ -3,7 +3,8 @@
 load    a 1280x720 video at 30 fps in a loop through all nodes, with adjustment and recording: rate, drops, latency
         from the image's stamp to pose3d/initial, the adjustment's duration, processor time, with the adjuster and
         without (`--seconds 300`; `--processes` or `--one-process`, `--no-adjuster` for one case; `--seamless`: no
-        cuts, so that a subject is tracked all the time)
+        cuts, so that a subject is tracked all the time; `--slow 1 2 3`: also on a machine that is so many times slower,
+        by stopping all nodes for that share of every 12 ms: their priorities count as before)
 kills   SIGKILL of each node in turn, a person in view all the time: time until it works again, gaps in the recording
         (`--rounds 5`)
 
@@ -37,6 +38,8 @@ TITLES = {
 }
 PARTS = tuple(TITLES)
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
+#: Of a slower machine: stop and go.
+TURN_S = 0.012
 #: Networks, discovery and the first window take their time: not part of the figures.
 WARM_S = 15.0
 
@@ -51,6 +54,7 @@ def main() -> int:
     parser.add_argument("--one-process", action="store_true")
     parser.add_argument("--processes", action="store_true")
     parser.add_argument("--no-adjuster", action="store_true")
+    parser.add_argument("--slow", type=float, nargs="+", default=[1.0], metavar="N", help="times slower")
     parser.add_argument("--seamless", action="store_true", help="the video there and back again, without cuts")
     args = parser.parse_args()
     for part in args.parts or PARTS:
@@ -67,22 +71,19 @@ def show(title: str, figures: dict[str, Any]) -> None:
 def page(part: str, results: dict[str, Any]) -> str:
     """Table of a part's main figures, one row per case or node; then all other figures."""
     if part == "load":
-        head = ("graph", "images with a result, per s (without one)", "`pose3d/initial` p50 / p95 / p99, ms",
+        shown = "pose2d", "pose3d/initial", "pose3d/latest"
+        head = ("graph", "images with a result, per s (without one)", *(f"`{t}` p50 / p95 / p99, ms" for t in shown),
                 "processors, % of one core")  # fmt: skip
         rows = [
             (
                 name,
                 f"{f['per second']['pose2d']} ({f['images without keypoints %']} %)",
-                " / ".join(map(str, f["latency ms p50 / p95 / p99"]["pose3d/initial"])),
+                *(" / ".join(map(str, f["latency ms p50 / p95 / p99"].get(t, ["-"]))) for t in shown),
                 f["CPU %, of one core"]["sum"],
             )
             for name, f in results.items()
         ]
         rest = results
-    elif part == "memory":
-        head = ("node", "MiB at minute 2", "largest difference")
-        rows = [(k, v["MiB at minute 2"], v["farthest"]) for k, v in results.items() if isinstance(v, dict)]
-        rest = {"run": {k: v for k, v in results.items() if not isinstance(v, dict)}}
     else:
         head = ("node", "topic", "s from SIGKILL to its first message")
         rows = [(name, SIGNS.get(name, "the next file"), text_of(v)) for name, v in results["seconds"].items()]
@@ -148,12 +149,55 @@ def vehicle(port: int) -> Iterator[None]:
         process.wait()
 
 
+def family(pid: int) -> list[int]:
+    """A process and those that it has started; none that have ended."""
+    with contextlib.suppress(OSError):
+        lists = [path.read_text().split() for path in Path(f"/proc/{pid}/task").glob("*/children")]
+        return [pid, *(found for child in itertools.chain(*lists) for found in family(int(child)))]
+    return []
+
+
 def usage(pid: int) -> tuple[float, float]:
-    """Processor seconds and resident MiB of a process so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    page_mib = os.sysconf("SC_PAGE_SIZE") / 2**20
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), pages * page_mib
+    """Processor seconds and resident MiB of a process and its children so far."""
+    ticks = pages = 0
+    for one in family(pid):
+        fields = Path(f"/proc/{one}/stat").read_text().rsplit(")", 1)[1].split()
+        ticks += int(fields[11]) + int(fields[12])
+        pages += int(Path(f"/proc/{one}/statm").read_text().split()[1])
+    return ticks / os.sysconf("SC_CLK_TCK"), pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@contextlib.contextmanager
+def slowed(pids: list[int], times: float) -> Iterator[None]:
+    """Run processes and their children on a machine that is so many times slower: they are stopped for that share."""
+    if times <= 1.0:
+        yield
+        return
+    script = f"import live; live.stop_and_go({times!r}, {pids!r})"
+    process = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def stop_and_go(times: float, pids: list[int]) -> None:
+    """Body of the process that stops others, until SIGTERM or its parent's death."""
+    with contextlib.suppress(OSError):
+        os.nice(-15)
+    ended: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))
+    parent, turns, found = os.getppid(), 0, list[int]()
+    while not ended and os.getppid() == parent:
+        if turns % 100 == 0:
+            found = [one for pid in pids for one in family(pid)]
+        turns += 1
+        for order, share in ((signal.SIGSTOP, 1.0 - 1.0 / times), (signal.SIGCONT, 1.0 / times)):
+            for pid in found:
+                with contextlib.suppress(OSError):
+                    os.kill(pid, order)
+            time.sleep(TURN_S * share)
 
 
 def taken_by_host() -> tuple[int, int]:
@@ -175,16 +219,19 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         for adjuster in (True, False):
             if args.no_adjuster and adjuster:
                 continue
-            name = ("processes" if processes else "one process") + ("" if adjuster else ", no adjuster")
-            load = os.getloadavg()[0]
-            results[name] = measure_load(video, folder / name.replace(" ", "_"), processes, adjuster, args)
-            results[name]["load average before"] = round(load, 2)
-            show(f"load, {name}, {args.seconds:g} s", results[name])
+            for slow in args.slow:
+                name = ("processes" if processes else "one process") + ("" if adjuster else ", no adjuster")
+                name += f", {slow:g} times slower" if slow > 1.0 else ""
+                load = os.getloadavg()[0]
+                place = folder / name.replace(" ", "_")
+                results[name] = measure_load(video, place, processes, adjuster, args, slow)
+                results[name]["load average before"] = round(load, 2)
+                show(f"load, {name}, {args.seconds:g} s", results[name])
     return results
 
 
 def measure_load(
-    video: Path, session: Path, processes: bool, adjuster: bool, args: argparse.Namespace
+    video: Path, session: Path, processes: bool, adjuster: bool, args: argparse.Namespace, slow: float = 1.0
 ) -> dict[str, Any]:
     from drocap_ros.bringup import bringup
     from drocap_ros.simulation.vehicle.loopback import free_udp_port
@@ -192,14 +239,17 @@ def measure_load(
     nodes = [name for name in NODES if adjuster or name != "bundle_adjuster"]
     port = free_udp_port()
     config = graph_config(video, session, port, args.threads, args.pose_model)
-    with vehicle(port), bringup(config, nodes, processes=processes, respawn=True) as graph:
-        graph.spin_for(WARM_S)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(vehicle(port))
+        graph = stack.enter_context(bringup(config, nodes, processes=processes, respawn=True))
         pids = {graph.pid(name): name if processes else "all nodes" for name in nodes}
-        before, begin_ns = {pid: usage(pid)[0] for pid in pids}, time.time_ns()
-        taken = taken_by_host()
-        graph.spin_for(args.seconds)
-        taken = (taken_by_host()[0] - taken[0], taken_by_host()[1] - taken[1])
-        after, end_ns = {pid: usage(pid) for pid in pids}, time.time_ns()
+        with slowed(list(pids), slow):
+            graph.spin_for(WARM_S)
+            before, begin_ns = {pid: usage(pid)[0] for pid in pids}, time.time_ns()
+            taken = taken_by_host()
+            graph.spin_for(args.seconds)
+            taken = (taken_by_host()[0] - taken[0], taken_by_host()[1] - taken[1])
+            after, end_ns = {pid: usage(pid) for pid in pids}, time.time_ns()
     cpu = {pids[pid]: round(100 * (after[pid][0] - before[pid]) / ((end_ns - begin_ns) * 1e-9)) for pid in pids}
     return {
         **session_figures(session, begin_ns, end_ns),

@@ -30,7 +30,7 @@ CLOCKED = (
 COMPUTING = ("system/test_packaging.py", "system/test_simulated_demo.py")
 #: Those of them that count messages or frames while the graph is busy: many tests beside them disturb them.
 COUNTING = (
-    "nodes/test_bundle_adjuster.py", "nodes/test_live_replay.py", "system/test_bringup.py",
+    "nodes/test_bundle_adjuster.py", "nodes/test_live_replay.py", "ros/test_slow_stages.py", "system/test_bringup.py",
     "system/test_live_faults.py", "system/test_orbit", "view",
 )  # fmt: skip
 #: Files that take longest begin, so that none of them ends alone.

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.msg import Pose2D, Pose3D
+from drocap_ros.msg import Pose2D
 from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.live.frame_buffer import StreamEvent
 from drocap_ros.reconstruction.live.initializer import LiveInitializer
 from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key, of
-from drocap_ros.skeleton import BODY_17
 
 
 class InitializerNode(ComponentNode):
@@ -29,7 +28,7 @@ class InitializerNode(ComponentNode):
         """Declare endpoints and state."""
         self._initializer = LiveInitializer(self.config)
         self._initial = self.output("pose3d/initial")
-        self.input("pose2d", self._on_pose2d)
+        self.input("pose2d", self._on_pose2d, newest=True)
 
     def _on_pose2d(self, message: Pose2D) -> None:
         observation = pose2d_from_ros(message)
@@ -43,18 +42,7 @@ class InitializerNode(ComponentNode):
         if pose is None:
             self.report(WARN, f"image {event}")
             return
-        self._initial.publish(
-            pose3d_to_ros(
-                message.header,
-                track_id=message.track_id,
-                stage=Pose3D.INITIAL,
-                skeleton=BODY_17.name,
-                joints=pose.joints3d,
-                covariance=pose.covariance,
-                confidence=pose.confidence,
-                reprojection_rms_px=pose.reprojection_rms_px,
-            )
-        )
+        self._initial.publish(pose3d_to_ros(pose, message.header.frame_id))
         self.count(Key.POSES)
         self.produced(observation.stamp_ns)
         if np.isfinite(pose.joints3d).all():

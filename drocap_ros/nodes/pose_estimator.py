@@ -8,6 +8,7 @@ image's header.
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -15,66 +16,75 @@ from typing import NamedTuple
 
 import numpy as np
 from sensor_msgs.msg import CompressedImage, RegionOfInterest
-from std_msgs.msg import Header
 
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.recording.image_messages import image_from_message
-from drocap_ros.ros.component import OK, WARN, ComponentNode, Gaps, MessageInfo
+from drocap_ros.ros.component import OK, WARN, ComponentNode, Gaps, Line, MessageInfo
 from drocap_ros.ros.conversions import background_to_ros, pose2d_to_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.own_process import LoadShedding, LookAhead
-from drocap_ros.ros.topics import IMAGE_IN_GRAPH_QOS, TOPICS, publishers_of
+from drocap_ros.ros.topics import IMAGE_IN_GRAPH_QOS, publishers_of, subscribers_of
 
 _TOPIC = "image/compressed"
+_DEPTH = 4  # images that may wait
 
 
 class ImageSample(NamedTuple):
-    """An image (H, W, 3) uint8 BGR that waited to be processed.
+    """An image's message that waited to be processed.
 
     missed : images dropped since the one before
     waited : whether it arrived while the one before was processed
     behind : how many wait behind it
     """
 
-    header: Header
-    image: np.ndarray
+    message: CompressedImage
     missed: int
     waited: bool
     behind: int
 
 
 class ImageQueue:
-    """Images between the thread that receives and the thread that processes: the newest ``depth``."""
+    """Images between the thread that receives and the thread that processes: the newest ``depth``.
 
-    def __init__(self, depth: int) -> None:
-        self._images: deque[tuple[Header, np.ndarray]] = deque(maxlen=depth)
-        self._missed = 0
+    Those that have waited too long are passed over (:class:`Line`).  ``clock`` : ns, that of the receptions
+    """
+
+    def __init__(self, depth: int, clock: Callable[[], int] = time.time_ns) -> None:
+        self._images: deque[tuple[CompressedImage, int]] = deque(maxlen=depth)
+        self._clock, self._line = clock, Line(periods=1.0)
+        self._missed = self._begin_ns = 0
         self._busy = False
         self._closed = False
         self._changed = threading.Condition()
 
-    def put(self, header: Header, image: np.ndarray, missed: int = 0) -> None:
+    def put(self, message: CompressedImage, missed: int = 0) -> None:
         """Append an image; ``missed`` images before it were lost elsewhere."""
         with self._changed:
             self._missed += missed + (len(self._images) == self._images.maxlen)
-            self._images.append((header, image))
+            self._images.append((message, self._clock()))
             self._changed.notify_all()
 
     def take(self) -> ImageSample | None:
-        """Oldest image that waits, or the next one; None at the end.  The image taken before is then done."""
+        """Next image; None at the end.  The image taken before is then done."""
         with self._changed:
+            if self._busy:
+                self._line.took((self._clock() - self._begin_ns) * 1e-9)
             self._busy = False
             self._changed.notify_all()
             waited = bool(self._images)
             self._changed.wait_for(lambda: self._images or self._closed)
             if self._closed:
                 return None
-            self._busy = True
+            self._busy, self._begin_ns = True, self._clock()
+            message, received_ns = self._images.popleft()
+            while self._line.passes_over({"received_timestamp": received_ns}, self._begin_ns) and self._images:
+                message, received_ns = self._images.popleft()
+                self._missed += 1
             missed, self._missed = self._missed, 0
-            return ImageSample(*self._images.popleft(), missed, waited, len(self._images))
+            return ImageSample(message, missed, waited, len(self._images))
 
     def wait_idle(self, timeout_s: float) -> bool:
         """Wait until no image waits or is processed; returns whether that was reached."""
@@ -89,13 +99,12 @@ class ImageQueue:
 
 
 class ImageInput:
-    """Subscription to ``image/compressed`` that decodes in the node's thread and processes in one of its own.
+    """Subscription to ``image/compressed`` that processes in a thread of its own: no image is decoded in vain.
 
     In simulated time it processes each image on arrival: however long that takes, no image waits or is dropped.
 
     node : the node that subscribes
     process : called in that thread with a sample; an InputError is counted, any other error ends the node
-    decode : CompressedImage -> image; may raise InputError
     depth : images that may wait
     """
 
@@ -103,12 +112,10 @@ class ImageInput:
         self,
         node: ComponentNode,
         process: Callable[[ImageSample], None],
-        decode: Callable[..., np.ndarray],
         depth: int,
     ) -> None:
         self._node = node
         self._process = node.guarded(_TOPIC, process, stamps=False)  # validated on arrival
-        self._decode = decode
         self._gaps = Gaps()
         self._queue = ImageQueue(depth)
         qos = IMAGE_IN_GRAPH_QOS if publishers_of(_TOPIC, node.peers) else None
@@ -128,11 +135,11 @@ class ImageInput:
             self._thread.join(timeout=5.0)
 
     def _on_message(self, message: CompressedImage, info: MessageInfo) -> None:
-        image, missed = self._decode(message), self._gaps.before(info)
+        missed = self._gaps.before(info)
         if self._node.simulated:
-            self._process_now(ImageSample(message.header, image, missed, waited=False, behind=0))
+            self._process_now(ImageSample(message, missed, waited=False, behind=0))
         else:
-            self._queue.put(message.header, image, missed)
+            self._queue.put(message, missed)
 
     def _process_now(self, sample: ImageSample) -> None:
         if sample.missed:
@@ -142,10 +149,6 @@ class ImageInput:
     def _run(self) -> None:
         while (sample := self._queue.take()) is not None:
             self._process_now(sample)
-
-
-#: Stands for an image whose subject is known already.
-_NOT_NEEDED = np.empty((0, 0, 3), np.uint8)
 
 
 class PoseEstimatorNode(ManagedComponent):
@@ -166,7 +169,7 @@ class PoseEstimatorNode(ManagedComponent):
         self._load_shedding = LoadShedding(self.config.max_load_level)
         self._pose2d = self.output("pose2d")
         self._background = self.output("background")
-        self._images = ImageInput(self, self._on_image, self._decoded, TOPICS["image/compressed"].qos.depth)
+        self._images = ImageInput(self, self._on_image, _DEPTH)
         self.input("roi", self._on_roi)
 
     def acquire(self) -> None:
@@ -194,11 +197,6 @@ class PoseEstimatorNode(ManagedComponent):
         if ahead is not None:
             ahead.close()
 
-    def _decoded(self, message: CompressedImage) -> np.ndarray:
-        if self._ahead is not None and self._ahead.knows(stamp_from_ros(message.header.stamp)):
-            return _NOT_NEEDED
-        return image_from_message(message, compressed=True)
-
     def _on_roi(self, message: RegionOfInterest) -> None:
         x, y = message.x_offset, message.y_offset
         self._roi = np.array([x, y, x + message.width, y + message.height], np.float64)
@@ -216,17 +214,19 @@ class PoseEstimatorNode(ManagedComponent):
     def _on_image(self, sample: ImageSample) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
         level = self._load_shedding.level(self.now_s(), sample.waited, sample.behind)
-        header, stamp_ns = sample.header, stamp_from_ros(sample.header.stamp)
+        header = sample.message.header
+        stamp_ns = stamp_from_ros(header.stamp)
         observation = None if self._ahead is None else self._ahead.take(stamp_ns)
         if observation is None:
             roi, self._roi = self._roi, None
-            observation = self._estimator.process(sample.image, stamp_ns, roi, level)
+            image = image_from_message(sample.message, compressed=True)
+            observation = self._estimator.process(image, stamp_ns, roi, level)
         if level:
             self.count(Key.IMAGES_SHED)
         if self._estimator.propagated:
             self.count(Key.IMAGES_PROPAGATED)
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
-        if observation.background is not None:
+        if observation.background is not None and (not self.peers or subscribers_of("background", self.peers)):
             self._background.publish(background_to_ros(observation.background, header))
         self.count(Key.IMAGES)
         self.produced(observation.stamp_ns)

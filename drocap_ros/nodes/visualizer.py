@@ -62,9 +62,9 @@ class VisualizerNode(ComponentNode):
         self._humans = HumanTopics(self, self._prefix) if self.config.human_topics and AVAILABLE else None
         if self.config.human_topics and not AVAILABLE:
             self.get_logger().warning(MISSING)
-        self.input("pose2d", self._on_pose2d)
-        self.input("pose3d/initial", self._on_initial)
-        self.input("pose3d/latest", self._on_latest)
+        self.input("pose2d", self._on_pose2d, newest=True)
+        self.input("pose3d/initial", self._on_initial, newest=True)
+        self.input("pose3d/latest", self._on_latest, newest=True)
         self.input("vehicle/state", self._on_state)
 
     def _on_pose2d(self, message: Pose2D) -> None:

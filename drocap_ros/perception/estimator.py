@@ -96,7 +96,7 @@ class PoseEstimator:
             after each run of the pose network; a detection has one window, no second pass, and after a clear pose
             an interval of ``load_level * detect_every_s``; after a run of the pose network without a person it pauses
             for ``load_level`` images, doubled at each further failure up to four times that, unless the detection is
-            clear
+            clear; from 2 on the scene's points are followed ten times a second
         ahead : the next image, whose scene another thread follows meanwhile; the results are the same without it
         """
         _check_image(image)
@@ -108,9 +108,9 @@ class PoseEstimator:
             self._margins, self._certain, self._seen_ns = None, None, 0
         self._last_ns = stamp_ns
         roi = _validated_roi(roi)
-        scene = self._scene_of(image, stamp_ns, ahead)
+        scene = self._scene_of(image, stamp_ns, ahead, seldom=load_level > 1)
         # A camera that repeats its picture shows nothing new: the bridge knows that by the same keypoints, bit for bit.
-        if scene.points is None and self._certain is not None and roi is None:
+        if scene.again and self._certain is not None and roi is None:
             observation = dataclasses.replace(self._certain, stamp_ns=stamp_ns)
         else:
             self._motion = scene.motion if self.tracker.persons else None
@@ -122,12 +122,12 @@ class PoseEstimator:
         self._boxes.append([person.box.copy() for person in persons])
         return dataclasses.replace(observation, background=scene.points)
 
-    def _scene_of(self, image: np.ndarray, stamp_ns: int, ahead: Frame | None) -> SceneStep:
+    def _scene_of(self, image: np.ndarray, stamp_ns: int, ahead: Frame | None, *, seldom: bool) -> SceneStep:
         """The scene in this image; that in the next one is begun."""
         begun, self._ahead = self._ahead, None
         scene = None if begun is None else begun[1].result()
         if scene is None or begun is None or begun[0].image is not image:
-            scene = self._scene.step(image, stamp_ns, self._boxes[0])
+            scene = self._scene.step(image, stamp_ns, self._boxes[0], seldom=seldom)
         if ahead is not None:
             step = self._beside.submit(self._scene.step, ahead.image, ahead.stamp_ns, self._boxes[1])
             self._ahead = ahead, step

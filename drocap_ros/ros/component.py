@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
@@ -36,6 +36,14 @@ from drocap_ros.stamps import StampValidator
 _CLOCK_STANDS_S = 5.0
 #: Between looks for a publisher that keeps its last message.
 _KEPT_PERIOD_S = 0.5
+#: Where a node is too slow, a message that has waited longer than this is passed over: more than two images at 30 Hz.
+_LONGEST_WAIT_S = 0.07
+#: After a pause of the machine a node that is fast enough works off what has waited for less than this.
+_LONGEST_PAUSE_S = 1.0
+#: Then all are passed over that have waited longer than this share of it: up to the newest.
+_CAUGHT_UP = 0.4
+#: Seconds over which a node says how many messages it passes over.
+_PASSED_S = 10
 #: A node whose input has been silent for this long is idle.
 IDLE_S = 3.0
 
@@ -51,6 +59,39 @@ class Gaps:
         number = info["publication_sequence_number"] or 0
         last, self._last = self._last, number
         return number - 1 - last if 0 < last < number - 1 else 0
+
+
+class Line:
+    """Tells of messages that are passed over where a node takes longer for one than it takes the next to come.
+
+    Those that have waited too long are, up to the newest.
+
+    periods : of the node's own work that a message may wait
+    """
+
+    def __init__(self, periods: float = 2.0) -> None:
+        self.behind = False
+        self._periods = periods
+        self._last_ns = 0
+        self._took_s: deque[float] = deque(maxlen=8)
+
+    def passes_over(self, info: MessageInfo, now_ns: int) -> bool:
+        """Whether this message is passed over, by the time since the middleware received it."""
+        received_ns = info["received_timestamp"] or now_ns
+        since_last_s, self._last_ns = (received_ns - self._last_ns) * 1e-9, received_ns
+        # The longest may be a pause of the machine.
+        took_s = (sum(self._took_s) - max(self._took_s, default=0.0)) / max(len(self._took_s) - 1, 1)
+        waited_s = (now_ns - received_ns) * 1e-9
+        limit_s = max(self._periods * took_s, _LONGEST_WAIT_S)
+        if self.behind:
+            self.behind = waited_s > _CAUGHT_UP * limit_s
+        else:
+            self.behind = waited_s > (limit_s if took_s > since_last_s else max(limit_s, _LONGEST_PAUSE_S))
+        return self.behind
+
+    def took(self, seconds: float) -> None:
+        """Record how long the last message took that was not passed over."""
+        self._took_s.append(seconds)
 
 
 class ComponentNode(Node):
@@ -90,6 +131,9 @@ class ComponentNode(Node):
         self._counting = threading.Lock()
         self.details: dict[str, str] = {Key.READY: "false"}
         self._latency = Latency()
+        #: Results so far; with those and what was missed the node says whether this machine keeps up.
+        self.handled = 0
+        self._passed: deque[tuple[int, int]] = deque([(0, 0)], maxlen=_PASSED_S)
         self.ready = False
         #: Whether messages are taken; only a managed node is ever inactive.
         self.active = True
@@ -163,12 +207,16 @@ class ComponentNode(Node):
         qos: QoSProfile | None = None,
         events: SubscriptionEventCallbacks | None = None,
         with_info: bool = False,
+        newest: bool = False,
     ) -> Subscription:
         """Subscription to a topic of the table; an InputError of the callback is counted and reported, not raised.
 
         with_info : the callback's second argument is rclpy's message info
+        newest : messages that have waited in line are passed over and counted; in simulated time none waits
         """
         entry = TOPICS[topic]
+        if newest and not self.simulated:
+            callback, with_info = self._newest(topic, callback), True
         take = self.guarded(topic, callback, stamps=entry.one_clock)
         if with_info:
             take = taking_info(take)
@@ -181,6 +229,19 @@ class ComponentNode(Node):
         if topic == "camera_info" and not self.simulated:
             self.create_timer(_KEPT_PERIOD_S, partial(self._hear_kept, topic, subscribe))
         return subscription
+
+    def _newest(self, topic: str, callback: Callable[..., None]) -> Callable[..., None]:
+        line = Line()
+
+        def take(message: Message, info: MessageInfo) -> None:
+            begin_ns = time.time_ns()
+            if line.passes_over(info, begin_ns):
+                self.missed(topic, 1)
+                return
+            callback(message)
+            line.took((time.time_ns() - begin_ns) * 1e-9)
+
+        return take
 
     def _hear_kept(self, topic: str, subscribe: Callable[..., Subscription]) -> None:
         """Subscribe a second time, until a message comes, where a publisher keeps its last one for late subscribers."""
@@ -283,6 +344,7 @@ class ComponentNode(Node):
 
     def produced(self, stamp_ns: int) -> None:
         """Note that the result of the image of this stamp has just been published."""
+        self.handled += 1
         self._latency.add((self.now_ns() - stamp_ns) * 1e-9, self.now_s())
 
     def report(self, level: bytes, text: str) -> None:
@@ -311,11 +373,24 @@ class ComponentNode(Node):
                 return f"no message on {topic} {since}{nobody}"
         return ""
 
+    def _passed_over(self) -> int:
+        """Share of the last images that were passed over, %."""
+        missed = sum(number for key, number in self.counters.items() if key.startswith(f"{Key.MISSED}/"))
+        handled, (handled_before, missed_before) = self.handled, self._passed[0]
+        self._passed.append((handled, missed))
+        missed, handled = missed - missed_before, handled - handled_before
+        share = round(100 * missed / max(missed + handled, 1))
+        if handled:
+            self.details[Key.PASSED_OVER] = str(share)
+        return share
+
     def publish_diagnostics(self) -> None:
         """Publish the status now; a timer does so once a second."""
         level, text = self._level, self._text
         if level != ERROR and (reason := self.idle_reason()):
             level, text = WARN, f"idle: {reason}"
+        if passed := self._passed_over():
+            text += f"; this machine passes over {passed} %"
         if late_ms := self._latency.percentiles_ms():
             for key, value in zip((Key.LATENCY_P50, Key.LATENCY_P95, Key.LATENCY_P99), late_ms, strict=True):
                 self.details[key] = f"{value:.1f}"
@@ -336,4 +411,4 @@ class ComponentNode(Node):
         self._diagnostics.publish(message)
 
 
-__all__ = ["ERROR", "HARDWARE_ID", "OK", "WARN", "ComponentNode", "Gaps", "MessageInfo"]
+__all__ = ["ERROR", "HARDWARE_ID", "OK", "WARN", "ComponentNode", "Gaps", "Line", "MessageInfo"]

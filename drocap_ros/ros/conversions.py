@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from array import array
 
@@ -19,8 +18,8 @@ from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.reconstruction.live.latest_pose import PlacedPose
-from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.live.initializer import LivePose
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
 from drocap_ros.skeleton import BODY_15, BODY_17, joint_set
 from drocap_ros.srv import OrbitCommand
@@ -115,96 +114,68 @@ def background_to_ros(points: FixedPoints, header: Header) -> BackgroundTracks:
     return BackgroundTracks(header=header, track=array("q", points.track.tolist()), point=floats(points.point))
 
 
-def pose3d_to_ros(  # noqa: PLR0913 -- the fields of the message
-    header: Header,
-    *,
-    track_id: int,
-    stage: int,
-    skeleton: str,
-    joints: np.ndarray,
-    covariance: np.ndarray,
-    confidence: np.ndarray,
-    reprojection_rms_px: float,
-    camera_rotation: np.ndarray | None = None,
-    metric: bool = False,
-) -> Pose3D:
-    """Pose (P, 3) m with covariance (P, 6) m^2 in the header's frame -> message.
-
-    camera_rotation : (3, 3) map -> camera, None = unknown
-    """
+def pose3d_to_ros(pose: LivePose, frame_id: str) -> Pose3D:
+    """A pose in a frame -> message; it is metric in ``map`` alone."""
+    turn = np.full(4, np.nan) if pose.rotation is None else quaternion_from_matrix(pose.rotation)
     return Pose3D(
-        header=header,
-        track_id=track_id,
-        stage=stage,
-        skeleton=skeleton,
-        joints=floats(joints),
-        covariance=floats(covariance),
-        confidence=floats(confidence),
-        camera_orientation=_camera_orientation(camera_rotation),
-        metric=metric,
-        reprojection_rms=float(reprojection_rms_px),
+        header=header_at(pose.stamp_ns, frame_id),
+        track_id=pose.track_id,
+        stage=Pose3D.REFINED if pose.refined else Pose3D.INITIAL,
+        skeleton=(BODY_17 if len(pose.joints3d) == len(BODY_17) else BODY_15).name,
+        joints=floats(pose.joints3d),
+        covariance=floats(pose.covariance),
+        confidence=floats(pose.confidence),
+        camera_orientation=quaternion_to_ros(turn),
+        metric=frame_id == MAP,
+        reprojection_rms=float(pose.reprojection_rms_px),
     )
 
 
-def _camera_orientation(rotation: np.ndarray | None) -> Quaternion:
-    return quaternion_to_ros(np.full(4, np.nan) if rotation is None else quaternion_from_matrix(rotation))
-
-
-def latest_pose_to_ros(
-    initial: Pose3D, joints: np.ndarray, *, refined: bool, placed: PlacedPose | None = None
-) -> Pose3D:
-    """The initial pose's message with other joints (P, 3) m, or with those that are placed in ``map``."""
-    latest = copy.copy(initial)
-    latest.stage, latest.joints = Pose3D.REFINED if refined else Pose3D.INITIAL, floats(joints)
-    if placed is not None:
-        latest.header = Header(stamp=initial.header.stamp, frame_id=MAP)
-        latest.joints, latest.covariance = floats(placed.joints), floats(placed.covariance)
-        latest.camera_orientation, latest.metric = _camera_orientation(placed.rotation), True
-    return latest
+def pose3d_from_ros(message: Pose3D) -> LivePose:
+    """Message -> pose, float64, in the message's own frame; of the camera's orientation nothing is read."""
+    count = len(joint_set(message.skeleton)) if message.track_id else 0
+    return LivePose(
+        stamp_from_ros(message.header.stamp),
+        message.track_id,
+        float_array(message.joints, (count, 3), "joints").astype(np.float64),
+        float_array(message.covariance, (count, 6), "covariance").astype(np.float64),
+        float_array(message.confidence, (count,), "confidence").astype(np.float64),
+        message.reprojection_rms,
+        refined=message.stage == Pose3D.REFINED,
+    )
 
 
 def window_to_ros(
-    window: AdjustedWindow,
-    header: Header,
-    track_id: int,
-    sequence: int,
-    solve_seconds: float,
-    known_ns: tuple[int, int] = (0, 0),
+    window: Window, solved: AdjustedWindow, camera_frame: str, sequence: int, solve_seconds: float
 ) -> Pose3DWindow:
-    """Adjusted window -> message.
-
-    header : stamp of the newest image and frame of its initial pose
-    known_ns : stamps of the newest vehicle state and fixed points that it knew
-    """
-    in_map = window.in_map
-    frame_id = header.frame_id if in_map is None else ODOM if in_map.path else MAP
+    """Window and its solution -> message; ``camera_frame`` : of the images."""
+    in_map = solved.in_map
+    frame_id = camera_frame if in_map is None else ODOM if in_map.path else MAP
     poses = [
-        pose3d_to_ros(
-            header_at(stamp_ns, frame_id),
-            track_id=track_id,
-            stage=Pose3D.REFINED,
-            skeleton=(BODY_17 if window.joints3d.shape[1] == len(BODY_17) else BODY_15).name,
-            joints=window.joints3d[i],
-            covariance=window.covariance[i],
-            confidence=window.confidence[i],
-            reprojection_rms_px=float(window.reprojection_rms_px[i]),
-            camera_rotation=None if in_map is None else in_map.rotation[i],
-            metric=in_map is not None and not in_map.path,
+        LivePose(
+            stamp_ns,
+            window.track_id,
+            solved.joints3d[i],
+            solved.covariance[i],
+            solved.confidence[i],
+            solved.reprojection_rms_px[i],
+            refined=True,
+            rotation=None if in_map is None else in_map.rotation[i],
         )
-        for i, stamp_ns in enumerate(window.stamp_ns)
+        for i, stamp_ns in enumerate(solved.stamp_ns)
     ]
     return Pose3DWindow(
-        header=Header(stamp=header.stamp, frame_id=frame_id),
-        poses=poses,
+        header=header_at(window.stamp_ns[-1], frame_id),
+        poses=[pose3d_to_ros(pose, frame_id) for pose in poses],
         window_seq=sequence,
-        iterations=window.iterations,
-        cost=float(window.cost),
-        stop_reason=window.stop_reason,
+        iterations=solved.iterations,
+        cost=float(solved.cost),
+        stop_reason=solved.stop_reason,
         solve_seconds=solve_seconds,
-        stride=window.effort.stride,
-        steps=array("I", window.effort.steps or ()),
-        telemetry_stamp=stamp_to_ros(known_ns[0]),
-        background_stamp=stamp_to_ros(known_ns[1]),
+        stride=solved.effort.stride,
+        steps=array("I", solved.effort.steps or ()),
+        telemetry_stamp=stamp_to_ros(window.known_ns[0]),
+        background_stamp=stamp_to_ros(window.known_ns[1]),
     )
 
 
@@ -214,13 +185,6 @@ def camera_transform(window: AdjustedWindow, child: str) -> TransformStamped:
     rotation, position, _, _ = window.in_map
     turn = quaternion_from_matrix(rotation[-1:].swapaxes(1, 2))[0]
     return transform_to_ros(header_at(int(window.stamp_ns[-1]), ODOM), child, position[-1], turn)
-
-
-def pose3d_from_ros(message: Pose3D) -> tuple[np.ndarray, np.ndarray]:
-    """Message -> joints (P, 3) m and confidence (P,), both float64, in the message's own frame."""
-    count = len(joint_set(message.skeleton)) if message.track_id else 0
-    joints = float_array(message.joints, (count, 3), "joints").astype(np.float64)
-    return joints, float_array(message.confidence, (count,), "confidence").astype(np.float64)
 
 
 def orbit_request(

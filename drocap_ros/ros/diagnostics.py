@@ -38,6 +38,7 @@ class Key:
     MESSAGES_REFUSED = "messages_refused"
     MISSED = "missed"  # messages that were published and that the busy subscriber never took
     LOST = "lost"  # messages that the middleware lost
+    PASSED_OVER = "passed_over_percent"  # of the images of the last seconds: this machine is too slow for them
     NOT_WRITTEN = "not_written"  # messages that the disk was too slow for
     IMAGES_LATE = "images_late"  # images of a file that was read too slowly
     IMAGES_SKIPPED = "images_skipped"  # by max_rate_hz
@@ -67,7 +68,8 @@ class Key:
 _WORDS = {
     Key.MESSAGES_REFUSED: "messages refused",
     Key.LAST_REFUSED: "last refused message",
-    Key.MISSED: "dropped while busy",
+    Key.MISSED: "passed over",
+    Key.PASSED_OVER: "passed over lately, %",
     Key.LOST: "lost by the middleware",
     Key.NOT_WRITTEN: "dropped: disk too slow",
     Key.IMAGES_LATE: "images dropped: source read too slowly",

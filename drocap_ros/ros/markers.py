@@ -63,7 +63,7 @@ def human_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformS
 
     The links have the axes of the body: joints alone do not determine the rotation of a limb about itself.
     """
-    joints, _ = pose3d_from_ros(message)
+    joints = pose3d_from_ros(message).joints3d
     joints_of = joint_set(message.skeleton) if message.track_id else None
     if joints_of is None or not {"lhip", "rhip", "lshoulder", "rshoulder", "pelvis", "neck"} <= set(joints_of.joints):
         return []
@@ -155,7 +155,7 @@ _SIGMAS = 2.0
 
 def pose_markers(message: Pose3D, lifetime_s: float) -> MarkerArray:
     """Skeleton, joints and their uncertainty ellipsoids of one pose, in the pose's frame, for ``lifetime_s``."""
-    joints, _ = pose3d_from_ros(message)
+    joints = pose3d_from_ros(message).joints3d
     if not len(joints):
         return MarkerArray()
     joints_of = joint_set(message.skeleton)
@@ -237,7 +237,7 @@ def _line(marker: ImageMarker, start: np.ndarray, end: np.ndarray, colour: Color
 
 def body_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformStamped]:
     """One frame per joint, ``<prefix>body_<id>/<joint>``, for viewers that draw no markers."""
-    joints, _ = pose3d_from_ros(message)
+    joints = pose3d_from_ros(message).joints3d
     return [
         transform_to_ros(message.header, f"{frame_prefix}body_{message.track_id}/{name}", p)
         for name, p in zip(joint_set(message.skeleton).joints, joints, strict=False)

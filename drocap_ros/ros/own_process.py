@@ -5,24 +5,27 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-import multiprocessing
 import os
+import pickle
 import signal
+import socket
+import subprocess
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
-from typing import Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from drocap_ros.errors import NodeError
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.sources.image_files import decoded
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.common.engine import blas_threads
+
+if TYPE_CHECKING:
+    from drocap_ros.perception.estimator import PoseEstimator
 
 _CALM_S = 1.0  # time without a queued image before the level falls; a shorter one lets the backlog return at once
 _RISE_S = 0.2  # shortest time between two rises: each level needs time to take effect
@@ -98,6 +101,11 @@ class _Estimator:
 
     def observe(self, jpeg: bytes, stamp_ns: int, roi: np.ndarray | None) -> PoseObservation:
         """The subject in a picture."""
+        # Not every function in a process of its own needs these.
+        from drocap_ros.perception.estimator import PoseEstimator
+        from drocap_ros.perception.load_models import models_folder
+        from drocap_ros.perception.sources.image_files import decoded
+
         if self._estimator is None:
             self._estimator = PoseEstimator(models_folder(self._config.models_dir), self._config)
         return self._estimator.process(decoded(np.frombuffer(jpeg, np.uint8), "jpeg"), stamp_ns, roi)
@@ -121,19 +129,28 @@ LEAN = {
 class OwnProcess(Generic[_P, _R]):
     """A function, or a method whose object lives on there, with one BLAS thread: results are those of this process.
 
-    call : with its object, its arguments and its results it can be pickled
+    call : with its object, its arguments and its results it can be pickled, and its module imported by name
+    niceness : Unix niceness there; above 0 the process never preempts one that is less nice
 
     The package's messages are those of the level that this process has now.
     """
 
-    def __init__(self, call: Callable[_P, _R]) -> None:
-        self._end, far_end = multiprocessing.Pipe()
-        # A fork of this process would hold its threads' locks; the server of forks is for nodes (``processes.py``).
-        context = multiprocessing.get_context("spawn")
-        self._process = context.Process(target=_serve, args=(far_end, call, _log.level), daemon=True)
-        with environment({**LEAN, **os.environ}):
-            self._process.start()
-        far_end.close()  # so that the death of either process ends the other's wait
+    def __init__(self, call: Callable[_P, _R], niceness: int = 0) -> None:
+        here, there = socket.socketpair()
+        # A fork of this process would hold its threads' locks, and those of `multiprocessing` run the user's script
+        # anew and may not start from a daemon, which a node is.
+        with there:
+            numbers = ", ".join(map(str, (there.fileno(), _log.level, niceness)))
+            body = f"import sys; sys.path[:] = sys.argv[1:]; from {__name__} import serve; serve({numbers})"
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", body, *sys.path],
+                env={**LEAN, **os.environ},
+                pass_fds=(there.fileno(),),
+                stdin=subprocess.DEVNULL,
+            )
+        # With the other end closed here, the death of either process ends the other's wait.
+        self._end = Connection(here.detach())
+        self._end.send_bytes(pickle.dumps(call))
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         """The result of a call, or its error; one thread calls at a time.
@@ -145,16 +162,19 @@ class OwnProcess(Generic[_P, _R]):
             self._end.send((args, kwargs))
             result, error = self._end.recv()
         except (EOFError, OSError):
-            self._process.join()
-            raise NodeError(f"a process of this node ended with status {self._process.exitcode}") from None
+            raise NodeError(f"a process of this node ended with status {self._process.wait()}") from None
         if error is not None:
             raise error
         return result
 
+    def kill(self) -> None:
+        """End the process at once: a call that runs in another thread raises NodeError."""
+        self._process.kill()
+
     def close(self) -> None:
         """End the process after its last call."""
         self._end.close()
-        self._process.join()
+        self._process.wait()
 
 
 @contextlib.contextmanager
@@ -172,10 +192,17 @@ def environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _serve(end: Connection, call: Callable[..., object], level: int) -> None:
+def serve(descriptor: int, level: int, niceness: int) -> None:
+    """Body of such a process."""
     _log.setLevel(level)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the command
-    with end, blas_threads(1), contextlib.suppress(EOFError, OSError):  # until the other end is closed, or has died
+    if niceness:
+        with contextlib.suppress(OSError, AttributeError):  # not every system has them
+            os.nice(niceness)
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    # Until the other end is closed, or has died.
+    with Connection(descriptor) as end, blas_threads(1), contextlib.suppress(EOFError, OSError):
+        call = pickle.loads(end.recv_bytes())
         while True:
             args, kwargs = end.recv()
             answer: tuple[object, Exception | None]

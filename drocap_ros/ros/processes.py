@@ -60,8 +60,7 @@ class LaunchContext:
         self.environment = {**LEAN, **os.environ, "ROS_DOMAIN_ID": str(domain_id)}
         # The server of this Python process serves all its graphs; it has no thread besides those of LTTng, which its
         # forks do not need.
-        solvers = ["scipy.linalg.lapack", "scipy.ndimage"] if "bundle_adjuster" in names else []
-        _FORKSERVER.set_forkserver_preload([*(f"drocap_ros.nodes.{name}" for name in names), *solvers])
+        _FORKSERVER.set_forkserver_preload([f"drocap_ros.nodes.{name}" for name in names])
         path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
         resource_tracker.ensure_running()  # which unblocks the signal
         with environment({**LEAN, **os.environ, "PYTHONPATH": path}), _blocked(signal.SIGTERM):

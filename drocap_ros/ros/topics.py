@@ -82,7 +82,7 @@ class NodeEntry(NamedTuple):
 
     source : the node is activated when all other nodes are ready, and may end by itself
     live : ``drocap live`` starts the node by default
-    niceness : Unix niceness of its process.  The flight loop, the pose estimator and the initializer have 0
+    niceness : Unix niceness of its process.  The flight loop has 0, and what leads from a picture to its initial pose
     """
 
     publishes: tuple[str, ...] = ()
@@ -94,7 +94,7 @@ class NodeEntry(NamedTuple):
 
 #: In the order in which nodes start and stop: from the sources downwards.
 NODES: dict[str, NodeEntry] = {
-    "image_ingest": NodeEntry(("image/compressed", "camera_info"), source=True, live=True, niceness=5),
+    "image_ingest": NodeEntry(("image/compressed", "camera_info"), source=True, live=True),
     "flight_simulator": NodeEntry(("image/compressed", "camera_info"), source=True),
     "pose_estimator": NodeEntry(("pose2d", "background"), ("image/compressed", "roi"), live=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
@@ -102,7 +102,7 @@ NODES: dict[str, NodeEntry] = {
         ("pose3d/refined", "pose3d/latest", *_TF),
         ("pose2d", "pose3d/initial", "background", "vehicle/state", "camera_info"),
         live=True,
-        niceness=15,
+        niceness=3,  # its adjustments, which have a process of their own, 19
     ),
     "mavlink_bridge": NodeEntry(
         ("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status"), live=True

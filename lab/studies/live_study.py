@@ -15,8 +15,10 @@ from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.live.adjuster import LiveAdjuster
+from drocap_ros.reconstruction.live.core import LiveCore, Step, live_results
+from drocap_ros.reconstruction.live.initializer import LiveInitializer
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
-from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_15, BODY_17
@@ -143,30 +145,33 @@ def simulate_live(
     shape = (len(stamps), len(BODY_17), 3)
     initial, latest, refined = (np.full(shape, np.nan) for _ in range(3))
     initial_std, refined_std = np.full(shape, np.nan), np.full(shape, np.nan)
-    seconds: dict[type, list[float]] = {LivePose: [], LiveWindow: []}
-    steps = list[float]()
+    initial_s, solve_s, steps = list[float](), list[float](), list[float]()
     newest, pending = LatestPose(adjuster.blend_s), deque[AdjustedWindow]()
+    live = LiveInitializer(initializer), LiveCore(adjuster), LiveAdjuster(adjuster)
     clock = time.perf_counter()
-    for result in live_poses(observations(view), initializer, adjuster):
-        seconds[type(result)].append(time.perf_counter() - clock)
-        if isinstance(result, LivePose):
-            now = result.observation.stamp_ns
-            i, joints = place[now], result.joints3d.astype(float)
+    for result in live_results(observations(view), *live, delay_s=delay_s):
+        took_s = time.perf_counter() - clock
+        if isinstance(result, Step):
+            assert result.latest is not None
+            initial_s.append(took_s)
+            now = result.initial.stamp_ns
+            i, joints = place[now], result.initial.joints3d.astype(np.float32).astype(float)
             # The same image with the previous image's correction: the step that new solutions cause.
             before = newest.pose(int(stamps[max(i - 1, 0)]), joints)
             while pending and pending[0].stamp_ns[-1] + delay_s * 1e9 <= now:
                 newest.set_solution(median_bone_lengths(pending.popleft().joints3d), now)
-            initial[i], initial_std[i] = joints, _std(result.pose.covariance)
-            latest[i] = newest.pose(now, joints)
+            initial[i], initial_std[i] = joints, _std(result.initial.covariance)
+            latest[i] = result.latest.joints3d
             steps.append(float(np.linalg.norm(latest[i] - before, axis=-1).max()))
         else:
-            window = result.window
+            _, window = result
+            solve_s.append(took_s)
             pending.append(window)
             age_s = (window.stamp_ns[-1] - window.stamp_ns) * 1e-9
             rows = np.array([place[int(stamp)] for stamp in window.stamp_ns])
             # Later windows overwrite earlier ones until the pose has that age.
             chosen = (age_s + delay_s <= REFINED_AFTER_S) & (stamps[-1] - window.stamp_ns >= REFINED_AFTER_S * 1e9)
-            refined[rows[chosen]] = result.joints3d[chosen]
+            refined[rows[chosen]] = window.joints3d[chosen].astype(np.float32)
             refined_std[rows[chosen]] = _std(window.covariance[chosen])
         clock = time.perf_counter()
     return LiveResult(
@@ -176,8 +181,8 @@ def simulate_live(
         initial_std,
         refined_std,
         np.array(steps),
-        np.array(seconds[LivePose]),
-        np.array(seconds[LiveWindow]),
+        np.array(initial_s),
+        np.array(solve_s),
     )
 
 

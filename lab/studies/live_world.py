@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.background import Background
+from drocap_ros.background import FixedPoints, PointHistory
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.tables import WORLD_HEAD, markdown_table, world_cells
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
-from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.live.latest_pose import LatestPlace, LatestPose, median_bone_lengths
-from drocap_ros.reconstruction.live.replay import LivePose, live_poses
-from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.live.adjuster import LiveAdjuster
+from drocap_ros.reconstruction.live.core import LiveCore, Step, live_results
+from drocap_ros.reconstruction.live.initializer import LiveInitializer
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from lab.studies.live_study import REFINED_AFTER_S, observations
 from lab.studies.protocol import FPS, reported
@@ -87,35 +86,21 @@ def _row(name: str, view: WorldView, delay_s: float) -> LiveWorldRow | None:
 def _live(view: WorldView, delay_s: float) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
     """Frame -> joints (17, 3) m in ``map``: as ``pose3d/latest`` is published, and refined 2 s later."""
     tracks, adjuster = view.tracks, BundleAdjusterConfig()
-    stamps, history = tracks.stamp_ns, _history(view)
+    stamps, core = tracks.stamp_ns, LiveCore(adjuster)
+    core.cameras, core.points = _history(view), _points(view)
     place = {int(stamp): i for i, stamp in enumerate(stamps)}
     latest, refined = dict[int, np.ndarray](), dict[int, np.ndarray]()
-    lengths, placing = LatestPose(adjuster.blend_s), LatestPlace(adjuster.blend_s)
-    pending = deque[AdjustedWindow]()
-    points_at = _points(view)
-    results = live_poses(
-        observations(view), InitializerConfig(), adjuster, camera_at=history.along, points_at=points_at
-    )
-    for result in results:
-        if isinstance(result, LivePose):
-            now, o = result.observation.stamp_ns, result.observation
-            while pending and pending[0].stamp_ns[-1] + delay_s * 1e9 <= now:
-                window = pending.popleft()
-                lengths.set_solution(median_bone_lengths(window.joints3d), now)
-                placing.set_solution(window, now)
-            rigid = lengths.pose(now, result.joints3d.astype(float))
-            camera = history.along(np.array([now], np.int64))
-            keypoints = o.body_keypoints().xy
-            placed = placing.place(now, (rigid, result.pose.covariance), keypoints, camera)
-            if placed is not None:
-                latest[place[now]] = placed.joints
+    live = LiveInitializer(), core, LiveAdjuster(adjuster)
+    for result in live_results(observations(view), *live, delay_s=delay_s):
+        if isinstance(result, Step):
+            if result.latest is not None and result.latest.rotation is not None:
+                latest[place[result.latest.stamp_ns]] = result.latest.joints3d
             continue
-        window = result.window
-        pending.append(window)
+        _, window = result
         age_s = (window.stamp_ns[-1] - window.stamp_ns) * 1e-9
         if window.in_map is not None:
             for i in np.flatnonzero(age_s + delay_s <= REFINED_AFTER_S):
-                refined[place[int(window.stamp_ns[i])]] = result.joints3d[i].astype(float)
+                refined[place[int(window.stamp_ns[i])]] = window.joints3d[i].astype(np.float32).astype(float)
     last = int(stamps[-1] - REFINED_AFTER_S * 1e9)
     return latest, {i: joints for i, joints in refined.items() if stamps[i] <= last}
 
@@ -132,10 +117,14 @@ def _history(view: WorldView) -> CameraHistory:
     return history
 
 
-def _points(view: WorldView) -> Callable[[np.ndarray], Background | None]:
-    """Gives the fixed points in the images of a window's stamps (F,)."""
-    points, stamps = view.tracks.background, view.tracks.stamp_ns
-    return lambda window: None if points is None else points.of_frames(np.searchsorted(stamps, window))
+def _points(view: WorldView) -> PointHistory:
+    history, points = PointHistory(2.0 * LONGEST_S), view.tracks.background
+    if points is None:
+        return history
+    for i, stamp in enumerate(view.tracks.stamp_ns.tolist()):
+        here = points.frame == i
+        history.add(stamp, FixedPoints(points.track[here], points.point[here]))
+    return history
 
 
 def _errors(poses: dict[int, np.ndarray], truth: np.ndarray) -> WorldErrors:

@@ -45,3 +45,14 @@ def test_words_with_brackets_are_shown_as_they_are():
     shown = console.export_text()
     assert text in shown
     assert "[/i]" in shown
+
+
+def test_below_the_table_stands_whether_this_machine_keeps_up():
+    dashboard = Dashboard()
+    assert str(dashboard.table().caption) == ""
+    for name, share in (("drocap/a", "0"), ("drocap/b", "many")):
+        dashboard.take(SimpleNamespace(status=[status(name, b"\x00", "running", passed_over_percent=share)]))
+    assert str(dashboard.table().caption) == "this machine keeps up"
+    dashboard.take(SimpleNamespace(status=[status("drocap/b", b"\x00", "running", passed_over_percent="12")]))
+    assert str(dashboard.table().caption) == "this machine passes over 12 % in drocap/b"
+    assert str(dashboard.table("drocap/a").caption) == ""

@@ -1,8 +1,6 @@
-"""Initializer and bundle adjuster in the running graph, through all events of a stream."""
+"""Initializer and bundle adjuster in the running graph: in ``map``, in ``odom``, and with malformed poses."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +10,11 @@ from drocap_ros.background import FixedPoints
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, VehicleState
-from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.perception.calibration import CameraModel
+from drocap_ros.reconstruction.live.initializer import LivePose
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import (
     background_to_ros,
@@ -27,6 +26,7 @@ from drocap_ros.ros.conversions import (
     vehicle_state_to_ros,
 )
 from drocap_ros.ros.diagnostics import Key
+from drocap_ros.ros.topics import NODES as GRAPH
 from drocap_ros.ros.topics import TOPICS
 from drocap_ros.simulation.capture import simulate_capture
 
@@ -50,143 +50,55 @@ def observed(seconds, track_id=1, begin_ns=BEGIN, seed=0):
     ]
 
 
-def eventful():
-    """A stream with a duplicate, a late, a stray and a blind image, a gap, a second round, other subjects."""
-    first = observed(3.0)
-    unseen = {"keypoints": np.full((15, 2), np.nan), "covariance": np.full((15, 3), np.nan), "confidence": np.zeros(15)}
-    unseen = {name: values.astype(np.float32) for name, values in unseen.items()}
-    blind = replace(first[29], stamp_ns=first[29].stamp_ns + 1, **unseen)
-    stray = observed(0.05, begin_ns=BEGIN + 600 * S)[:1]  # farther away StampValidator refuses it
-    gap = observed(2.0, begin_ns=BEGIN + 6 * S, seed=1)
-    other = observed(2.5, track_id=2, begin_ns=BEGIN + 3 * S, seed=2)
-    hidden = [replace(o, track_id=3, stamp_ns=o.stamp_ns + 20 * S, **unseen) for o in first[:12]]
-    return [*first[:30], first[29], first[20], *stray, blind, *first[30:], *gap, *first, *other, *hidden]
-
-
-def fly(folder, observations, pause_s=0.035, **adjuster):
-    """Publish the observations to a recorded graph; gives latest poses, windows and what /diagnostics counted."""
-    config = DrocapConfig().replace("session_recorder", session_dir=str(folder))
-    config = config.replace("bundle_adjuster", period_s=0.5, window_s=4.0, **adjuster)
-    seen = {topic: [] for topic in ("pose3d/initial", "pose3d/latest", "pose3d/refined", "/diagnostics")}
-    with bringup(config, NODES) as graph:
-        for topic, messages in seen.items():
-            graph.node.create_subscription(TOPICS[topic].message, topic, messages.append, TOPICS[topic].qos)
-        publisher = graph.node.create_publisher(TOPICS["pose2d"].message, "pose2d", TOPICS["pose2d"].qos)
-        graph.wait_until(lambda: publisher.get_subscription_count() == 3, 20, "the nodes to listen")
-        for observation in observations:
-            publisher.publish(pose2d_to_ros(observation, "camera"))
-            graph.spin_for(pause_s)
-        last = observations[-1].stamp_ns
-        graph.wait_until(
-            lambda: any(stamp_from_ros(m.header.stamp) == last for m in seen["pose3d/latest"][-1:]), 30, "the last pose"
-        )
-        reports = len(seen["/diagnostics"])
-        graph.wait_until(lambda: len(seen["/diagnostics"]) > reports + 6, 20, "the counts on /diagnostics")
-    counts = {}
-    for message in seen["/diagnostics"]:
-        for status in message.status:
-            counts.setdefault(status.name.rsplit("/", 1)[-1], {}).update({v.key: v.value for v in status.values})
-    return seen, counts
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("events") / "session"
-    return folder, *fly(folder, eventful())
-
-
-def test_each_event_is_counted_by_its_key(flown):
-    _, _, counts = flown
-    found = counts["initializer"]
-    assert found["stream_event/duplicate"] == "1"
-    assert found["stream_event/late"] == "1"
-    # Ten minutes ahead, and the first image of the second round, which alone could be a stray as well.
-    assert found["stream_event/stray"] == "2"
-    assert found["stream_event/time_jump"] == "1"
-    assert found["stream_event/new_subject"] == "2"
-    assert found["stream_event/gap"] == "1"
-    assert found[Key.IMAGES_INCOMPLETE] == "13"
-    adjuster = counts["bundle_adjuster"]
-    assert adjuster["stream_event/time_jump"] == "1"
-    assert adjuster["stream_event/new_subject"] == "2"
-    assert int(adjuster[Key.ADJUSTMENTS]) >= 6
-    # A window without keypoints cannot be adjusted.
-    assert adjuster[Key.ADJUSTMENTS_FAILED] == "1"
-
-
-def test_every_initial_pose_has_a_latest_pose(flown):
-    _, seen, _ = flown
-    stamps = [[stamp_from_ros(m.header.stamp) for m in seen[t]] for t in ("pose3d/initial", "pose3d/latest")]
-    assert stamps[0] == stamps[1]
-    # Of 60 + 40 + 60 + 50 + 12 images and the blind one, the second round's first was dropped.
-    assert len(stamps[0]) == 222
-    stages = {m.stage for m in seen["pose3d/latest"]}
-    assert stages == {TOPICS["pose3d/latest"].message.INITIAL, TOPICS["pose3d/latest"].message.REFINED}
-
-
-def test_no_window_mixes_subjects_or_rounds(flown):
-    _, seen, _ = flown
-    for window in seen["pose3d/refined"]:
-        stamps = np.array([stamp_from_ros(pose.header.stamp) for pose in window.poses])
-        assert (np.diff(stamps) > 0).all()
-        assert len({pose.track_id for pose in window.poses}) == 1
-        assert stamps[-1] - stamps[0] < 3 * S
-        assert np.diff(stamps).max() < S
-
-
-@pytest.mark.parametrize("late", [False, True], ids=["in time", "always late"])
-def test_the_recording_repeats_the_windows_bit_for_bit(flown, tmp_path, late):
-    folder = flown[0]
-    if late:
-        folder = tmp_path / "session"
-        seen, counts = fly(folder, observed(4.0), pause_s=0.045, max_solve_s=0.01, max_stride=2)
-        assert int(counts["bundle_adjuster"][Key.ADJUSTMENTS_CUT]) >= 2
-        assert any(window.steps for window in seen["pose3d/refined"])
-        assert any(window.stride == 2 for window in seen["pose3d/refined"])
-    with open_session(folder) as session:
-        _, _, agreement = reconstruct_live(session, recorded_config(session))
-    assert agreement.initial[0] == agreement.initial[1] >= 80
-    assert agreement.windows[0] == agreement.windows[1] >= 4
-
-
-@pytest.fixture(scope="module")
-def orbited(tmp_path_factory):
-    """An orbit whose telemetry ends before its images; the session, the messages and the texts of /diagnostics."""
-    folder, flown = tmp_path_factory.mktemp("orbit") / "session", orbit(14.0, begin_ns=BEGIN)
+def fly(folder, flown, states_until_ns):
+    """An orbit's topics through a recorded graph, its vehicle's states up to a time; gives what was published."""
     config = DrocapConfig().replace("session_recorder", session_dir=str(folder))
     # A busy machine takes its time here, instead of every fourth image.
     config = config.replace("bundle_adjuster", max_solve_s=5.0)
-    seen = {topic: [] for topic in ("pose3d/latest", "pose3d/refined", "/diagnostics")}
-    width, height = flown.observations[0].image_size
-    camera = CameraModel(width, height, flown.matrix)
+    seen = {topic: [] for topic in ("pose3d/latest", "pose3d/refined", "/tf", "/diagnostics")}
+    camera = CameraModel(*flown.observations[0].image_size, flown.matrix)
     gimbal = quaternion_from_matrix(np.swapaxes(OPTICAL_FROM_FLU.T @ flown.rotation, 1, 2))
     with bringup(config, NODES) as graph:
         for topic, messages in seen.items():
             graph.node.create_subscription(TOPICS[topic].message, topic, messages.append, TOPICS[topic].qos)
-        publishers = {
+        publish = {
             topic: graph.node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
             for topic in ("pose2d", "vehicle/state", "camera_info", "background")
         }
         graph.wait_until(
-            lambda: [p.get_subscription_count() for p in publishers.values()] == [3, 2, 2, 2],
-            20,
-            "the nodes to listen",
+            lambda: [p.get_subscription_count() for p in publish.values()] == [3, 2, 2, 2], 20, "the nodes to listen"
         )
         for i, observation in enumerate(flown.observations):
             stamp_ns = observation.stamp_ns
-            if stamp_ns < BEGIN + 9.2 * S:
+            if stamp_ns < states_until_ns:
                 state = VehicleState(stamp_ns, position_enu_m=flown.position[i], gimbal_orientation_xyzw=gimbal[i])
-                publishers["vehicle/state"].publish(vehicle_state_to_ros(state))
-            publishers["camera_info"].publish(camera_info_to_ros(header_at(stamp_ns, "camera"), camera))
-            seen_here = flown.background.frame == i
-            points = FixedPoints(flown.background.track[seen_here], flown.background.point[seen_here])
-            publishers["background"].publish(background_to_ros(points, header_at(stamp_ns, "camera")))
-            publishers["pose2d"].publish(pose2d_to_ros(observation, "camera"))
+                publish["vehicle/state"].publish(vehicle_state_to_ros(state))
+            header, here = header_at(stamp_ns, "camera"), flown.background.frame == i
+            points = FixedPoints(flown.background.track[here], flown.background.point[here])
+            publish["camera_info"].publish(camera_info_to_ros(header, camera))
+            publish["background"].publish(background_to_ros(points, header))
+            publish["pose2d"].publish(pose2d_to_ros(observation, "camera"))
             graph.spin_for(0.066)
+        last_ns = flown.observations[-1].stamp_ns
+        graph.wait_until(
+            lambda: any(stamp_from_ros(m.header.stamp) == last_ns for m in seen["pose3d/latest"]), 30, "the last pose"
+        )
         reports = len(seen["/diagnostics"])
         graph.wait_until(lambda: len(seen["/diagnostics"]) > reports + 6, 20, "the counts on /diagnostics")
     texts = [s for m in seen["/diagnostics"] for s in m.status if s.name.endswith("bundle_adjuster")]
     return folder, flown, seen, texts
+
+
+@pytest.fixture(scope="module")
+def orbited(tmp_path_factory):
+    """An orbit whose telemetry ends before its images."""
+    return fly(tmp_path_factory.mktemp("orbit") / "session", orbit(14.0, begin_ns=BEGIN), BEGIN + 9.2 * S)
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """An orbit without a vehicle."""
+    return fly(tmp_path_factory.mktemp("odom") / "session", orbit(8.0, begin_ns=BEGIN), 0)
 
 
 def test_poses_with_telemetry_are_in_map_and_metric_until_it_stops(orbited):
@@ -236,28 +148,59 @@ def test_the_recording_of_windows_in_map_repeats_them_bit_for_bit(orbited):
         assert (motion.frame, len(motion.stamp_ns)) == ("camera", 210)
 
 
+def test_windows_without_telemetry_are_in_odom_with_their_camera_on_tf(walked):
+    _, true, seen, texts = walked
+    there = [w for w in seen["pose3d/refined"] if w.header.frame_id == "odom"]
+    assert there
+    for window in there:
+        assert {(p.header.frame_id, p.metric) for p in window.poses} == {("odom", False)}
+        assert all(np.isfinite(p.camera_orientation.w) for p in window.poses)
+        joints = np.reshape(window.poses[-1].joints, (-1, 3))
+        assert joints[8, 2] > joints[0, 2]  # the head above the pelvis
+    transforms = [t for m in seen["/tf"] for t in m.transforms if t.header.frame_id == "odom"]
+    assert [stamp_from_ros(t.header.stamp) for t in transforms] == [stamp_from_ros(w.header.stamp) for w in there]
+    assert {t.child_frame_id for t in transforms} == {"camera"}
+    up = [matrix_from_quaternion(np.array([q.x, q.y, q.z, q.w]))[2] for q in (t.transform.rotation for t in transforms)]
+    place = np.searchsorted(true.stamp_ns, [stamp_from_ros(t.header.stamp) for t in transforms])
+    assert np.degrees(np.arccos(np.sum(up * true.rotation[place][..., 2], axis=1))).max() < 4.0
+    # The newest pose is on its former path.
+    assert {m.header.frame_id for m in seen["pose3d/latest"]} == {"camera"}
+    told = [{v.key: v.value for v in status.values} for status in texts]
+    assert any("path 1, a camera that moves; up to" in values.get(Key.PICTURE_PATH, "") for values in told)
+    assert told[-1][Key.TELEMETRY] == "none"
+
+
+def test_the_recording_of_windows_in_odom_repeats_them_bit_for_bit(walked):
+    folder, true, seen, _ = walked
+    with open_session(folder) as session:
+        motion, _, agreement = reconstruct_live(session, recorded_config(session))
+        assert session.warnings == []
+    assert agreement.windows[0] == agreement.windows[1] >= len(seen["pose3d/refined"])
+    if motion.frame == "world":
+        assert (motion.metric, motion.scale_source) == (False, "assumed_height")
+    assert len(motion.joints3d) <= len(true.stamp_ns)
+
+
+def test_the_bridge_hears_no_3d_pose_and_no_transform():
+    assert set(GRAPH["mavlink_bridge"].subscribes) == {"pose2d", "camera_info", "orbit/status"}
+
+
 def initial_pose(observation, track_id, joints, skeleton=None):
     """An initial pose of 0, 15 or 17 joints."""
-    return pose3d_to_ros(
-        header_at(observation.stamp_ns, "camera"),
-        track_id=track_id,
-        stage=1,
-        skeleton=skeleton or f"body{joints or 15}",
-        joints=np.random.default_rng(joints).normal(size=(joints, 3)),
-        covariance=np.zeros((joints, 6)),
-        confidence=np.ones(joints),
-        reprojection_rms_px=1.0,
-    )
+    values = np.random.default_rng(joints).normal(size=(joints, 3)), np.zeros((joints, 6)), np.ones(joints)
+    message = pose3d_to_ros(LivePose(observation.stamp_ns, track_id, *values, 1.0), "camera")
+    message.skeleton = skeleton or message.skeleton
+    return message
 
 
 def test_initial_poses_of_another_subject_and_of_other_joints_do_not_end_the_node():
-    config = DrocapConfig().replace("bundle_adjuster", period_s=0.3, window_s=4.0, blend_s=1.0)
-    latest, reports = [], []
+    config = DrocapConfig().replace("bundle_adjuster", period_s=0.3, window_s=4.0, max_solve_s=5.0)
+    latest, reports, windows = [], [], []
     with bringup(config, ["bundle_adjuster"]) as graph:
         publishers = {}
         for topic in ("pose2d", "pose3d/initial"):
             publishers[topic] = graph.node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
-        for topic, into in (("pose3d/latest", latest), ("/diagnostics", reports)):
+        for topic, into in (("pose3d/latest", latest), ("pose3d/refined", windows), ("/diagnostics", reports)):
             graph.node.create_subscription(TOPICS[topic].message, topic, into.append, TOPICS[topic].qos)
         graph.wait_until(lambda: all(p.get_subscription_count() for p in publishers.values()), 20, "the node to listen")
 
@@ -270,6 +213,8 @@ def test_initial_poses_of_another_subject_and_of_other_joints_do_not_end_the_nod
         taken = [o for burst in range(4) for o in observed(1.0, begin_ns=BEGIN + 3 * S * burst)[::2]]
         for i, observation in enumerate(taken):
             publish(observation, 1, (15, 17)[i // 10 % 2])
+            if i % 10 == 9:
+                graph.wait_until(lambda burst=i // 10: len(windows) > burst, 30, "a window of these joints")
         for observation, pose in zip(
             observed(0.3, begin_ns=BEGIN + 14 * S), [(1, 17, "coco17"), (0, 0), (2, 15)], strict=False
         ):

@@ -38,10 +38,10 @@ def test_a_replay_repeats_the_initial_poses_of_the_flight(captured):
         live = {
             stamp_from_ros(m.header.stamp): np.array(m.joints) for _, m in session.messages(("/drocap/pose3d/initial",))
         }
-    got, took_s = play(captured, 60, rate=4.0, topics="pose2d")
+    got, took_s = play(captured, 60, rate=1.5, topics="pose2d")
     stamps = [stamp_from_ros(m.header.stamp) for m in got["pose2d"]]
     assert stamps == tracks.stamp_ns.tolist()
-    assert 0.5 < took_s < 4.0
+    assert 2.0 < took_s < 6.0
     again = {stamp_from_ros(m.header.stamp): np.array(m.joints) for m in got["pose3d/initial"]}
     assert again.keys() == live.keys()
     assert all(np.array_equal(again[stamp], live[stamp]) for stamp in live)
@@ -55,8 +55,9 @@ def test_a_replay_starts_in_the_middle_after_a_delay_and_without_a_clock(capture
     with open_session(captured) as session:
         log_ns = [raw.log_time_ns for raw, _ in session.messages(("/drocap/pose2d",))]
         start_s = (log_ns[20] - session.info.start_ns) * 1e-9
-    got, took_s = play(captured, 38, rate=20.0, topics="pose2d", start_s=start_s, delay_s=1.5, clock=False)
+    got, took_s = play(captured, 10, rate=20.0, topics="pose2d", start_s=start_s, delay_s=1.5, clock=False)
     assert took_s > 1.4
+    # The initializer, which is slower than that, passes over some.
     assert 38 <= len(got["pose2d"]) <= 41  # messages were recorded a moment after their stamps
     assert not got["clock"]
 

@@ -98,6 +98,19 @@ def test_points_on_a_person_end_where_the_camera_has_moved_them(frames):
     assert not on_it.any()
 
 
+def test_where_there_is_no_time_points_are_followed_ten_times_a_second_unless_the_camera_pans(frames):
+    image, scene = frames[0].image, Scene()
+    still = [np.roll(image, i % 2, axis=0) for i in range(13)]  # each differs from the one before
+    steps = [scene.step(picture, i * STEP_NS, [], seldom=True) for i, picture in enumerate(still)]
+    assert [i for i, step in enumerate(steps) if step.points is not None] == [0, 3, 6, 9, 12]
+    assert not any(step.again for step in steps)
+    assert np.isin(steps[12].points.track, steps[0].points.track).mean() > 0.7
+    assert scene.step(still[12], 13 * STEP_NS, [], seldom=True).again
+    pan = [scene.step(np.roll(image, 40 * i, axis=1), (20 + i) * STEP_NS, [], seldom=True) for i in range(1, 6)]
+    assert all(step.points is not None for step in pan[1:])
+    assert all(step.motion is not None for step in pan[1:])
+
+
 def test_calls_in_order_raise_their_errors():
     seen = []
 

@@ -9,10 +9,11 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
-from drocap_ros.keypoints import PoseObservation
+from drocap_ros.keypoints import Keypoints2D, PoseObservation
 from drocap_ros.msg import Pose3D
 from drocap_ros.reconstruction.common.poses import DEADLINE
-from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, InMap
+from drocap_ros.reconstruction.live.initializer import LivePose
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, InMap, Window
 from drocap_ros.ros import conversions as c
 from drocap_ros.skeleton import BODY_15
 
@@ -80,23 +81,20 @@ def test_a_stamp_before_1970_is_refused():
 def test_a_pose_keeps_every_bit_in_a_message():
     rng = np.random.default_rng(1)
     joints, confidence = rng.normal(size=(15, 3)).astype(np.float32), rng.uniform(size=15).astype(np.float32)
-    message = c.pose3d_to_ros(
-        c.header_at(9, "camera"),
-        track_id=1,
-        stage=Pose3D.INITIAL,
-        skeleton="body15",
-        joints=joints,
-        covariance=np.zeros((15, 6)),
-        confidence=confidence,
-        reprojection_rms_px=2.0,
-    )
-    back, sure = c.pose3d_from_ros(message)
-    np.testing.assert_array_equal(back, joints)
-    np.testing.assert_array_equal(sure, confidence)
+    message = c.pose3d_to_ros(LivePose(9, 1, joints, np.zeros((15, 6)), confidence, 2.0), "camera")
+    back = c.pose3d_from_ros(message)
+    np.testing.assert_array_equal(back.joints3d, joints)
+    np.testing.assert_array_equal(back.confidence, confidence)
+    assert (back.stamp_ns, back.track_id, back.refined, message.skeleton) == (9, 1, False, "body15")
     assert np.isnan(message.camera_orientation.w)
     message.joints = array("f", [0.0] * 44)
     with pytest.raises(InputError, match="joints: expected 45"):
         c.pose3d_from_ros(message)
+
+
+def given(stamp_ns):
+    frames = len(stamp_ns)
+    return Window(stamp_ns, Keypoints2D(np.zeros((frames, 17, 2))), np.zeros((frames, 17, 3)), track_id=7)
 
 
 def adjusted(effort):
@@ -118,21 +116,22 @@ def adjusted(effort):
 @pytest.mark.parametrize(("steps", "sent"), [(None, []), ((4, 2), [4, 2]), ((0, 3), [0, 3])])
 def test_a_window_message_states_its_effort(steps, sent):
     window = adjusted(Effort(2, steps))
-    message = c.window_to_ros(window, c.header_at(int(window.stamp_ns[-1]), "camera"), 7, 5, 0.25)
+    message = c.window_to_ros(given(window.stamp_ns), window, "camera", 5, 0.25)
     assert (message.window_seq, message.stride, list(message.steps)) == (5, 2, sent)
     assert {m.header.frame_id for m in (message, *message.poses)} == {"camera"}
     assert not any(pose.metric for pose in message.poses)
     assert c.stamp_from_ros(message.header.stamp) == window.stamp_ns[-1]
     assert {pose.stage for pose in message.poses} == {Pose3D.REFINED}
     for pose, joints in zip(message.poses, window.joints3d, strict=True):
-        np.testing.assert_array_equal(c.pose3d_from_ros(pose)[0], joints.astype(np.float32))
+        np.testing.assert_array_equal(c.pose3d_from_ros(pose).joints3d, joints.astype(np.float32))
 
 
 def test_a_window_in_map_states_frame_scale_camera_and_the_newest_state():
     rotation = np.stack([matrix_from_quaternion(np.array([0.5, -0.5, 0.1 * i, 0.7])) for i in range(3)])
     window = replace(adjusted(Effort()), in_map=InMap(rotation, np.zeros((3, 3)), np.zeros(6)))
     # The newest image is later than the newest pose: the camera's pose there was not known yet.
-    message = c.window_to_ros(window, c.header_at(10**9, "camera"), 7, 5, 0.25, (950_000_000, 960_000_000))
+    whole = given(np.arange(11) * 10**8)._replace(known_ns=(950_000_000, 960_000_000))
+    message = c.window_to_ros(whole, window, "camera", 5, 0.25)
     assert c.stamp_from_ros(message.header.stamp) == 10**9
     assert c.stamp_from_ros(message.telemetry_stamp) == 950_000_000
     assert c.stamp_from_ros(message.background_stamp) == 960_000_000

@@ -25,7 +25,7 @@ def test_every_text_belongs_to_a_key():
         (Key.MESSAGES_REFUSED, "messages refused"),
         (Key.EXPOSURES, "exposures"),
         (diagnostics.of(Key.STREAM_EVENT, "time_jump"), "stream event, time jump"),
-        (diagnostics.of(Key.MISSED, "/drocap/image/compressed"), "dropped while busy, drocap/image/compressed"),
+        (diagnostics.of(Key.MISSED, "/drocap/image/compressed"), "passed over, drocap/image/compressed"),
         ("key_of_another_version", "key of another version"),
     ],
 )

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import CompressedImage
 
 from drocap_ros.errors import InputError
 from drocap_ros.nodes.image_ingest import ImageIngestNode
@@ -32,7 +33,7 @@ def reading(context, folder, process, rate_hz=50.0, depth=1):
     config = ImageIngestConfig(source=str(folder), loop=True, folder_rate_hz=rate_hz)
     camera = ImageIngestNode(config, context=context, use_global_arguments=False)
     reader = InitializerNode(context=context, use_global_arguments=False)
-    source = ImageInput(reader, process, lambda message: image_from_message(message, compressed=True), depth)
+    source = ImageInput(reader, process, depth)
     executor = SingleThreadedExecutor(context=context)
     for node in (camera, reader):
         executor.add_node(node)
@@ -56,25 +57,28 @@ def reading(context, folder, process, rate_hz=50.0, depth=1):
             node.destroy_node()
 
 
-def test_images_arrive_decoded(context, folder):
+def test_images_arrive(context, folder):
     samples = []
     with reading(context, folder, samples.append) as (_, until):
         until(lambda: len(samples) >= 5)
-    levels = {round(float(sample.image.mean()) / 40) for sample in samples}
-    assert samples[0].image.shape == (48, 64, 3)
+    images = [image_from_message(sample.message, compressed=True) for sample in samples]
+    levels = {round(float(image.mean()) / 40) for image in images}
+    assert images[0].shape == (48, 64, 3)
     assert levels <= {0, 1, 2, 3, 4}
     assert len(levels) >= 3
 
 
+def numbered(count):
+    return [CompressedImage(header=header_at(i, "c")) for i in range(count)]
+
+
 def test_full_queue_drops_the_oldest_image_and_counts_it():
-    queue = ImageQueue(depth=2)
-    image = np.zeros((1, 1, 3), np.uint8)
-    headers = [header_at(i, "c") for i in range(5)]
-    for header in headers:
-        queue.put(header, image)
+    queue, images = ImageQueue(depth=2), numbered(5)
+    for image in images:
+        queue.put(image)
     assert not queue.wait_idle(timeout_s=0.0)
-    assert queue.take() == (headers[3], image, 3, True, 1)
-    assert queue.take() == (headers[4], image, 0, True, 0)
+    assert queue.take() == (images[3], 3, True, 1)
+    assert queue.take() == (images[4], 0, True, 0)
     assert not queue.wait_idle(timeout_s=0.0)  # the last one is still being processed
     queue.close()
     assert queue.take() is None
@@ -82,10 +86,9 @@ def test_full_queue_drops_the_oldest_image_and_counts_it():
 
 
 def test_image_that_did_not_wait_is_marked_so():
-    queue = ImageQueue(depth=2)
-    header, image = header_at(1, "c"), np.zeros((1, 1, 3), np.uint8)
-    threading.Timer(0.1, queue.put, [header, image]).start()
-    assert queue.take() == (header, image, 0, False, 0)
+    queue, (image,) = ImageQueue(depth=2), numbered(1)
+    threading.Timer(0.1, queue.put, [image]).start()
+    assert queue.take() == (image, 0, False, 0)
 
 
 def test_error_of_the_processing_thread_reaches_the_node(context, folder):

@@ -8,6 +8,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import Pose3D
+from drocap_ros.reconstruction.live.initializer import LivePose
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.skeleton import BODY_15
@@ -20,16 +21,7 @@ def pose(unknown=()):
     root = 0.1 * rng.normal(size=(15, 3, 3))
     full = root @ np.swapaxes(root, 1, 2)
     packed = full.reshape(15, 9)[:, [0, 1, 2, 4, 5, 8]]
-    message = pose3d_to_ros(
-        header_at(5, "camera_optical"),
-        track_id=4,
-        stage=Pose3D.INITIAL,
-        skeleton="body15",
-        joints=joints,
-        covariance=packed,
-        confidence=np.ones(15),
-        reprojection_rms_px=1.0,
-    )
+    message = pose3d_to_ros(LivePose(5, 4, joints, packed, np.ones(15), 1.0), "camera_optical")
     return message, joints, full
 
 

@@ -18,6 +18,7 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.nodes import visualizer
+from drocap_ros.reconstruction.live.initializer import LivePose
 from drocap_ros.ros import markers
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key
@@ -35,16 +36,7 @@ def capture():
 
 
 def pose3d(joints, track_id=7):
-    return pose3d_to_ros(
-        header_at(5, "map"),
-        track_id=track_id,
-        stage=Pose3D.INITIAL,
-        skeleton="body15",
-        joints=joints,
-        covariance=np.zeros((15, 6)),
-        confidence=np.ones(15),
-        reprojection_rms_px=1.0,
-    )
+    return pose3d_to_ros(LivePose(5, track_id, joints, np.zeros((15, 6)), np.ones(15), 1.0), "map")
 
 
 def observation(keypoints, track_id=7, size=(640, 480)):

@@ -85,16 +85,16 @@ def test_unknown_node_is_refused():
 
 
 def test_priority_of_a_process_follows_the_table_in_the_session_and_out_of_the_group_of_the_command(tmp_path):
-    with bringup(short_flight(tmp_path), CAPTURE, processes=True) as graph:
-        adjuster, simulator = graph.pid("bundle_adjuster"), graph.pid("session_player")
-        graph.wait_until(lambda: os.sched_getscheduler(adjuster) == os.SCHED_BATCH, 20, "the adjuster's priority")
-        threads = [int(path.name) for path in Path(f"/proc/{adjuster}/task").iterdir()]
-        assert min(os.getpriority(os.PRIO_PROCESS, thread) for thread in threads) == NODES["bundle_adjuster"].niceness
+    with bringup(short_flight(tmp_path), [*CAPTURE, "visualizer"], processes=True) as graph:
+        drawing, simulator = graph.pid("visualizer"), graph.pid("session_player")
+        graph.wait_until(lambda: os.sched_getscheduler(drawing) == os.SCHED_BATCH, 20, "the visualizer's priority")
+        threads = [int(path.name) for path in Path(f"/proc/{drawing}/task").iterdir()]
+        assert min(os.getpriority(os.PRIO_PROCESS, thread) for thread in threads) == NODES["visualizer"].niceness
         assert os.sched_getscheduler(simulator) == os.SCHED_OTHER
         assert os.getpriority(os.PRIO_PROCESS, simulator) == os.getpriority(os.PRIO_PROCESS, 0)
         # Niceness acts within a session only; Ctrl-C reaches the command's process group only.
-        assert os.getsid(adjuster) == os.getsid(simulator) == os.getsid(0)
-        assert {os.getpgid(adjuster), os.getpgid(simulator)} == {adjuster, simulator}
+        assert os.getsid(drawing) == os.getsid(simulator) == os.getsid(0)
+        assert {os.getpgid(drawing), os.getpgid(simulator)} == {drawing, simulator}
 
 
 @pytest.mark.skipif(

@@ -56,14 +56,28 @@ class Dashboard:
         for name in self.heard(namespace):
             level, text, values = self._rows[name]
             counts = ", ".join(
-                f"{words(key)} {value}" for key, value in values.items() if value.isdigit() or key in _SHOWN
+                f"{words(key)} {value}"
+                for key, value in values.items()
+                if key != Key.PASSED_OVER and (value.isdigit() or key in _SHOWN)
             )
             state, colour = _LEVELS.get(level, (str(level), "white"))
             latency = " / ".join(f"{number(values[key]):.0f}" for key in _LATENCY if key in values)
             # As Text: words of nodes, and of messages that they refused, may hold brackets, which are markup.
             shown, rate, status, amounts = map(Text, (name, values.get(Key.RATE, ""), text, counts))
             table.add_row(shown, Text(state, colour), rate, latency, status, amounts)
+        table.caption = Text(self._keeping_up(self.heard(namespace)))
         return table
+
+    def _keeping_up(self, names: list[str]) -> str:
+        """Whether this machine is fast enough, in words; "" before any node knows."""
+        shares = {name: number(self._rows[name][2].get(Key.PASSED_OVER, "")) for name in names}
+        known = {name: share for name, share in shares.items() if share >= 0}
+        if not known:
+            return ""
+        slow = {name: share for name, share in known.items() if share >= 1}
+        if not slow:
+            return "this machine keeps up"
+        return "this machine passes over " + ", ".join(f"{n:.0f} % in {name}" for name, n in slow.items())
 
 
 @contextlib.contextmanager

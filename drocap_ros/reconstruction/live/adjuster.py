@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -62,6 +64,11 @@ class LiveAdjuster:
         part = part._replace(keypoints=keypoints)
         with blas_threads(self._config.threads):
             return self._by_default(part, effort, cancelled)
+
+    def adjust_within(self, window: Window, effort: Effort, limit_s: float | None) -> AdjustedWindow:
+        """Adjust a window; end after the step in which a time (s) is over, None = none is."""
+        end_s = time.perf_counter() + (math.inf if limit_s is None else limit_s)
+        return self.adjust(window, effort, None if limit_s is None else lambda: time.perf_counter() > end_s)
 
     def _by_default(self, w: Window, effort: Effort, cancelled: Cancelled | None) -> AdjustedWindow:
         config = lifted_config(self._config, drawn_toes=True)

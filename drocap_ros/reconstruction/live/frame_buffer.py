@@ -1,10 +1,9 @@
-"""The frames of the live window, joined from two topics, and the time of the next adjustment."""
+"""The order of a stream's images, the frames of the live window, and the time of the next adjustment."""
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import deque
 from enum import Enum, auto
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -113,11 +112,6 @@ class StreamOrder:
 _FIRST = 3
 
 
-First = TypeVar("First")
-Second = TypeVar("Second")
-Part = TypeVar("Part")
-
-
 class FrameBuffer:
     """The last ``window_s`` of keypoints and initial poses of one subject; an adjustment is due every ``period_s``.
 
@@ -173,42 +167,7 @@ class FrameBuffer:
             ),
             np.array([joints[:count] for _, joints in self._frames], np.float64),
             self.subject,
+            track_id=observations[-1].track_id,
             image_size=observations[-1].image_size,
             assumed_focal_px=assumed_focal_px(observations[-1].image_size, self._config.assumed_focal),
         )
-
-
-class StampJoin(Generic[First, Second]):
-    """Pairs of the same stamp; topics keep no order between them, so either part may come first.
-
-    At most ``max_pending`` of each part wait; the oldest are dropped.
-    """
-
-    def __init__(self, max_pending: int) -> None:
-        self._max_pending = max_pending
-        self._first: OrderedDict[int, First] = OrderedDict()
-        self._second: OrderedDict[int, Second] = OrderedDict()
-        #: Parts dropped without their counterpart.
-        self.dropped_first = self.dropped_second = 0
-
-    def add_first(self, stamp_ns: int, item: First) -> tuple[First, Second] | None:
-        """The pair that the item completes, or None."""
-        if stamp_ns in self._second:
-            return item, self._second.pop(stamp_ns)
-        self.dropped_first += self._wait(self._first, stamp_ns, item)
-        return None
-
-    def add_second(self, stamp_ns: int, item: Second) -> tuple[First, Second] | None:
-        """The pair that the item completes, or None."""
-        if stamp_ns in self._first:
-            return self._first.pop(stamp_ns), item
-        self.dropped_second += self._wait(self._second, stamp_ns, item)
-        return None
-
-    def _wait(self, pending: OrderedDict[int, Part], stamp_ns: int, item: Part) -> int:
-        """Number of parts dropped for the new one."""
-        pending[stamp_ns] = item
-        dropped = max(len(pending) - self._max_pending, 0)
-        for _ in range(dropped):
-            pending.popitem(last=False)
-        return dropped

@@ -114,18 +114,25 @@ def person_size(keypoints: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class InitialPose:
-    """Pose of one image.
+class LivePose:
+    """Pose of one image as published.
 
-    joints3d : (17, 3) m, camera axes, pelvis at the origin; NaN when the image shows too little
-    covariance : (17, 6) m^2, xx xy xz yy yz zz
-    confidence : (17,) in [0, 1], 0 where the joint was not seen and the model filled it in
+    joints3d : (P, 3) m, camera axes with the pelvis at the origin, or in ``map`` where ``rotation`` is known; NaN when
+        the image shows too little
+    covariance : (P, 6) m^2, xx xy xz yy yz zz
+    confidence : (P,) in [0, 1], 0 where the joint was not seen and the model filled it in
+    refined : whether the bones have the lengths of an adjusted window
+    rotation : (3, 3) ``map`` -> camera, corrected
     """
 
+    stamp_ns: int
+    track_id: int
     joints3d: np.ndarray
     covariance: np.ndarray
     confidence: np.ndarray
     reprojection_rms_px: float
+    refined: bool = False
+    rotation: np.ndarray | None = None
 
 
 class LiveInitializer:
@@ -142,7 +149,7 @@ class LiveInitializer:
         self._order = StreamOrder(self.config.late_s, self.config.gap_s)
         self.event = StreamEvent.FIRST
 
-    def push(self, observation: PoseObservation) -> InitialPose | None:
+    def push(self, observation: PoseObservation) -> LivePose | None:
         """Pose of the next image, or None when ``event`` drops it."""
         keypoints = _keypoints(observation)
         self.event = self._order.classify(observation.stamp_ns, observation.track_id, observation.image_size)
@@ -156,14 +163,17 @@ class LiveInitializer:
         seen = confidence > 0.0
         extent = np.ptp(keypoints.xy[seen], axis=0).max() if seen.any() else 0.0
         if seen.sum() < MIN_JOINTS or not extent > 1e-3:
-            return _unknown()
+            nothing = np.full((len(BODY_17), 3), np.nan), np.full((len(BODY_17), 6), np.nan), np.zeros(len(BODY_17))
+            return LivePose(observation.stamp_ns, observation.track_id, *nothing, float("nan"))
         check_uncertainty(keypoints[None], seen[None])
         points = np.where(seen[:, None], keypoints.xy, np.nan)
         joints, std, metres = self._lifter.push(observation.stamp_ns, points, confidence)
         gap = joints[seen, :2] - keypoints.xy[seen]
         covariance = np.zeros((len(BODY_17), 6))
         covariance[:, [0, 3, 5]] = std[:, [0, 0, 1]] ** 2
-        return InitialPose(
+        return LivePose(
+            observation.stamp_ns,
+            observation.track_id,
             joints3d=(joints - joints[BODY_17.index("pelvis")]) * metres,
             covariance=covariance * metres**2,
             confidence=confidence,
@@ -178,8 +188,3 @@ def _keypoints(observation: PoseObservation) -> Keypoints2D:
         raise InputError("keypoints: expected finite px or NaN, got infinity; check the 2D joints")
     assert keypoints.covariance is not None
     return replace(keypoints, covariance=None) if np.isnan(keypoints.covariance).all() else keypoints
-
-
-def _unknown() -> InitialPose:
-    p = len(BODY_17)
-    return InitialPose(np.full((p, 3), np.nan), np.full((p, 6), np.nan), np.zeros(p), float("nan"))

@@ -7,13 +7,14 @@ and half a second on their errors differ.
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.geometry.alignment import bone_lengths
 from drocap_ros.geometry.rotations import exp_so3, unpack_covariance
+from drocap_ros.reconstruction.live.initializer import LivePose
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.reconstruction.world.world_model import MEASURED
@@ -31,23 +32,40 @@ _ERROR_OVER_SPEED_S = 0.05
 _ACROSS_M = 0.03
 
 
-class PlacedPose(NamedTuple):
-    """joints (P, 3) m and covariance (P, 6) m^2 in ``map``; rotation (3, 3) world -> camera, corrected."""
+class _Blended:
+    """A value that changes to each new one linearly within ``blend_s`` of stamps; None = there is none yet."""
 
-    joints: np.ndarray
-    covariance: np.ndarray
-    rotation: np.ndarray
+    def __init__(self, blend_s: float) -> None:
+        self._blend_ns = round(blend_s * 1e9)
+        self.reset()
 
+    def reset(self) -> None:
+        """Forget the values."""
+        self._before: np.ndarray | None = None
+        self.newest: np.ndarray | None = None
+        self._begin_ns = 0
 
-class _Solution(NamedTuple):
-    """correction : (6,) of the camera; factor : of the range; place : (6,) m^2, covariance of the newest pelvis."""
+    def set(self, value: np.ndarray, stamp_ns: int) -> None:
+        """Change to a value from the image of a stamp on."""
+        self._before, self.newest, self._begin_ns = self.at(stamp_ns), value, stamp_ns
 
-    correction: np.ndarray
-    factor: float
-    place: np.ndarray
+    @property
+    def first(self) -> bool:
+        """Whether there was no value before the newest one."""
+        return self._before is None
 
+    def share(self, stamp_ns: int) -> float:
+        """Share of the newest value at an image."""
+        if not self._blend_ns:
+            return 1.0
+        return min(max((stamp_ns - self._begin_ns) / self._blend_ns, 0.0), 1.0)
 
-_UNSOLVED = _Solution(np.zeros(6), 1.0, np.zeros(6))
+    def at(self, stamp_ns: int) -> np.ndarray | None:
+        """The value at an image."""
+        if self.newest is None or self._before is None:
+            return self.newest
+        share = self.share(stamp_ns)
+        return np.asarray((1.0 - share) * self._before + share * self.newest)
 
 
 class LatestPlace:
@@ -59,44 +77,41 @@ class LatestPlace:
     """
 
     def __init__(self, blend_s: float) -> None:
-        self._blend_ns = round(blend_s * 1e9)
+        # (13,): correction of the camera (6), factor of the range, covariance (6, m^2) of the newest pelvis.
+        self._solution = _Blended(blend_s)
         self.reset()
 
     def reset(self) -> None:
         """Forget the person and the solution."""
-        self._solution: _Solution | None = None
-        self._before: _Solution | None = None
-        self._begin_ns = 0
+        self._solution.reset()
         self._past: deque[tuple[int, np.ndarray, np.ndarray]] = deque(maxlen=_MOST_IMAGES)
         self._ranges: OrderedDict[int, float] = OrderedDict()
 
     def set_solution(self, window: AdjustedWindow, stamp_ns: int) -> None:
         """Take a window's solution from the image of ``stamp_ns`` on."""
         if window.in_map is None or window.in_map.path:
-            self._solution = self._before = None
+            self._solution.reset()
             return
-        solution = _Solution(window.in_map.correction, self._factor(window), window.covariance[-1, 0])
-        self._before = None if self._solution is None else self._blended(stamp_ns)
-        self._solution, self._begin_ns = solution, stamp_ns
+        correction, place = window.in_map.correction, window.covariance[-1, 0]
+        self._solution.set(np.concatenate([correction, [self._factor(window)], place]), stamp_ns)
 
-    def place(
-        self, stamp_ns: int, pose: tuple[np.ndarray, np.ndarray], keypoints: np.ndarray, camera: CameraPath | None
-    ) -> PlacedPose | None:
+    def place(self, pose: LivePose, keypoints: np.ndarray, camera: CameraPath | None) -> LivePose | None:
         """The image's pose in ``map``; None without a solution there, the camera's pose or enough keypoints.
 
-        pose : joints (P, 3) m and covariance (P, 6) m^2 in camera axes, pelvis at the origin
+        pose : in camera axes
         keypoints : (P, 2) px, NaN where not seen
         camera : as reported at this image alone
         """
-        joints, covariance = pose
+        joints, stamp_ns = pose.joints3d, pose.stamp_ns
         seen = np.isfinite(keypoints).all(axis=1)
         if camera is None or not camera.known[0] or not np.isfinite(joints).all() or seen.sum() < MIN_JOINTS:
             return None
-        solution = self._blended(stamp_ns) if self._solution is not None else _UNSOLVED
+        solution = self._solution.at(stamp_ns)
+        correction = np.zeros(6) if solution is None else solution[:6]
         (turn, place), matrix = camera.pose, camera.matrix
         assert matrix is not None
-        rotation: np.ndarray = exp_so3(solution.correction[None, 3:])[0] @ turn[0]
-        position = place[0] + solution.correction[:3]
+        rotation: np.ndarray = exp_so3(correction[None, 3:])[0] @ turn[0]
+        position = place[0] + correction[:3]
         body = joints @ rotation
         ray = np.column_stack([keypoints[seen] - matrix[:2, 2], np.full(seen.sum(), 1.0)])
         ray[:, :2] /= np.diagonal(matrix)[:2]
@@ -108,10 +123,11 @@ class LatestPlace:
         self._ranges[stamp_ns] = float(np.linalg.norm(sight))
         while len(self._ranges) > _MOST_IMAGES:
             self._ranges.popitem(last=False)
-        if self._solution is None:
+        if solution is None:
             return None
-        root = position + solution.factor * sight
-        return PlacedPose(root + body, _covariance(covariance, rotation, sight) + solution.place, rotation)
+        root = position + solution[6] * sight
+        covariance = _covariance(pose.covariance, rotation, sight) + solution[7:]
+        return replace(pose, joints3d=root + body, covariance=covariance, rotation=rotation)
 
     def _root(self, now_ns: int) -> np.ndarray:
         """(3,) m, the pelvis now: least distances from all rays of the past, at a constant velocity."""
@@ -135,19 +151,6 @@ class LatestPlace:
             if stamp in self._ranges
         ]
         return float(np.clip(np.median(both), *_FACTORS)) if both else 1.0
-
-    def _blended(self, stamp_ns: int) -> _Solution:
-        """The solution that holds at an image."""
-        assert self._solution is not None
-        passed = (stamp_ns - self._begin_ns) / self._blend_ns if self._blend_ns else 1.0
-        if self._before is None or passed >= 1.0:
-            return self._solution
-        share, old, new = max(passed, 0.0), self._before, self._solution
-        return _Solution(
-            (1.0 - share) * old.correction + share * new.correction,
-            (1.0 - share) * old.factor + share * new.factor,
-            (1.0 - share) * old.place + share * new.place,
-        )
 
 
 def _covariance(packed: np.ndarray, rotation: np.ndarray, sight: np.ndarray) -> np.ndarray:
@@ -179,48 +182,32 @@ class LatestPose:
     """
 
     def __init__(self, blend_s: float) -> None:
-        self._blend_ns = round(blend_s * 1e9)
-        self.reset()
+        self._lengths = _Blended(blend_s)
 
     def reset(self) -> None:
         """Forget the person."""
-        self._from: np.ndarray | None = None
-        self._to: np.ndarray | None = None
-        self._begin_ns = 0
+        self._lengths.reset()
 
     @property
     def corrected(self) -> bool:
         """Whether a solution has arrived."""
-        return self._to is not None
+        return self._lengths.newest is not None
 
     def set_solution(self, lengths: np.ndarray, stamp_ns: int) -> None:
         """Blend in a solution's bone lengths (16,) m from the image of ``stamp_ns`` on."""
-        if not np.isfinite(lengths).all():
-            return
-        self._from = self._lengths(stamp_ns)
-        self._to, self._begin_ns = lengths, stamp_ns
+        if np.isfinite(lengths).all():
+            self._lengths.set(lengths, stamp_ns)
 
     def pose(self, stamp_ns: int, joints: np.ndarray) -> np.ndarray:
         """Joints (P, 3) m in camera axes, pelvis at the origin, from the image's initial ones; NaN stays NaN."""
-        lengths = self._lengths(stamp_ns)
+        lengths = self._lengths.at(stamp_ns)
         if lengths is None or not np.isfinite(joints).all():
             return joints
         rigid = _with_lengths(joints, lengths)
-        if self._from is not None:
+        if not self._lengths.first:
             return rigid
-        share = self._share(stamp_ns)
+        share = self._lengths.share(stamp_ns)
         return (1.0 - share) * joints + share * rigid
-
-    def _lengths(self, stamp_ns: int) -> np.ndarray | None:
-        if self._to is None or self._from is None:
-            return self._to
-        share = self._share(stamp_ns)
-        return (1.0 - share) * self._from + share * self._to
-
-    def _share(self, stamp_ns: int) -> float:
-        if self._blend_ns == 0:
-            return 1.0
-        return min(max((stamp_ns - self._begin_ns) / self._blend_ns, 0.0), 1.0)
 
 
 def _with_lengths(joints: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -20,6 +20,10 @@ _FIRST_PAUSE_S = 4.0
 _LONGEST_PAUSE_S = 60.0
 
 
+#: Images without fixed points that are nearer than this to one with points are left out.
+_NEAR_NS = 120_000_000
+
+
 class Window(NamedTuple):
     """F frames of one subject.
 
@@ -31,6 +35,8 @@ class Window(NamedTuple):
     assumed_focal_px : of the lens where the camera is unknown; None = distant
     background : fixed points of the scene in its images; None = there are none
     image_size : width and height px
+    track_id : of the subject
+    known_ns : stamps of the newest state of the vehicle and fixed points that were known, 0 = none
     """
 
     stamp_ns: np.ndarray
@@ -41,6 +47,8 @@ class Window(NamedTuple):
     assumed_focal_px: float | None = None
     background: Background | None = None
     image_size: tuple[int, int] = (0, 0)
+    track_id: int = 0
+    known_ns: tuple[int, int] = (0, 0)
 
     @property
     def height_m(self) -> float:
@@ -49,10 +57,26 @@ class Window(NamedTuple):
         return float(np.median(limb_lengths(self.initial_joints[known]).sum(axis=-1)) / LIMBS_PER_STATURE)
 
     def every(self, stride: int) -> Window:
-        """Every ``stride``-th frame, counted back from the newest."""
-        return self.frames(slice((len(self.stamp_ns) - 1) % stride, None, stride))
+        """Every ``stride``-th frame, counted back from the newest.
 
-    def frames(self, use: slice) -> Window:
+        Where fixed points are followed in some images alone, as on a busy machine, the images near these are left out:
+        the camera's path is known in images with points.
+        """
+        count = len(self.stamp_ns)
+        kept = np.ones(count, bool)
+        if self.background is not None and len(self.background):
+            kept[:] = np.isin(np.arange(count), self.background.frame)
+            seen_ns = self.stamp_ns[kept]
+            after = np.minimum(np.searchsorted(seen_ns, self.stamp_ns), len(seen_ns) - 1)
+            gap_ns = np.abs(self.stamp_ns - np.stack([seen_ns[after], seen_ns[np.maximum(after - 1, 0)]]))
+            kept |= gap_ns.min(axis=0) > _NEAR_NS
+            kept[-1] = True
+        # The last one of each group of frames.
+        places = np.flatnonzero(kept)[::-1]
+        _, first = np.unique((count - 1 - places) // stride, return_index=True)
+        return self.frames(places[first][::-1])
+
+    def frames(self, use: slice | np.ndarray) -> Window:
         """Some of the frames."""
         camera = None if self.camera is None else self.camera.of_images(use)
         kept = np.arange(len(self.stamp_ns))[use]

@@ -9,8 +9,9 @@ import pytest
 from live_stream import observed
 from walking import stamps
 
+from drocap_ros.background import Background
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin, StreamEvent
+from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StreamEvent
 
 ADJUSTER = BundleAdjusterConfig(period_s=0.5, window_s=2.0)
 JOINTS = np.zeros((15, 3))
@@ -58,21 +59,24 @@ def test_every_nth_frame_is_counted_from_the_newest() -> None:
     assert part.keypoints.xy.shape == (4, 17, 2)
 
 
+def test_frames_near_those_with_fixed_points_are_left_out() -> None:
+    buffer = FrameBuffer(ADJUSTER)
+    for o in observed(10):
+        buffer.push(o, JOINTS)
+    seldom, always = (
+        Background(frames, np.arange(len(frames)), np.zeros((len(frames), 2), np.float32))
+        for frames in (np.array([1, 4, 7], np.int32), np.arange(10, dtype=np.int32))
+    )
+    part = buffer.window()._replace(background=seldom).every(2)
+    np.testing.assert_array_equal(part.stamp_ns, stamps(10)[[1, 4, 7, 9]])
+    assert part.background is not None
+    np.testing.assert_array_equal(part.background.frame, [0, 1, 2])
+    part = buffer.window()._replace(background=always).every(3)
+    np.testing.assert_array_equal(part.stamp_ns, stamps(10)[[0, 3, 6, 9]])
+
+
 def test_memory_is_bounded_at_any_frame_rate() -> None:
     buffer = FrameBuffer(BundleAdjusterConfig(window_frames=50))
     for i, o in enumerate(observed(60) * 2):
         buffer.push(replace(o, stamp_ns=i * 10**6), JOINTS)
     assert len(buffer.window().stamp_ns) == 50
-
-
-def test_parts_are_joined_in_any_order_and_old_ones_are_dropped() -> None:
-    join: StampJoin[str, int] = StampJoin(2)
-    assert join.add_first(1, "a") is None
-    assert join.add_second(1, 10) == ("a", 10)
-    assert join.add_second(2, 20) is None
-    assert join.add_first(2, "b") == ("b", 20)
-    for stamp in (3, 4, 5):
-        join.add_first(stamp, str(stamp))
-    assert (join.dropped_first, join.dropped_second) == (1, 0)
-    assert join.add_second(3, 30) is None
-    assert join.add_second(5, 50) == ("5", 50)

@@ -15,13 +15,13 @@ from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.live.frame_buffer import StreamEvent
-from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
+from drocap_ros.reconstruction.live.initializer import LiveInitializer, LivePose
 
 FRAMES = 72
 S = 10**9
 
 
-def push(initializer: LiveInitializer, observation: PoseObservation) -> InitialPose:
+def push(initializer: LiveInitializer, observation: PoseObservation) -> LivePose:
     pose = initializer.push(observation)
     assert pose is not None, initializer.event
     return pose
@@ -32,12 +32,12 @@ def joints(initializer: LiveInitializer, observations: Sequence[PoseObservation]
 
 
 @pytest.fixture(scope="module")
-def walked() -> tuple[Walk, list[InitialPose]]:
+def walked() -> tuple[Walk, list[LivePose]]:
     initializer = LiveInitializer()
     return make_walk(FRAMES), [push(initializer, o) for o in observed(FRAMES, covariance_px2=9.0)]
 
 
-def test_every_image_gets_a_pose_near_the_truth(walked: tuple[Walk, list[InitialPose]]) -> None:
+def test_every_image_gets_a_pose_near_the_truth(walked: tuple[Walk, list[LivePose]]) -> None:
     walk, poses = walked
     truth, found = 1000.0 * walk.in_camera, np.stack([p.joints3d for p in poses])
     assert pa_mpjpe(found, truth).mean() < 80.0
@@ -47,13 +47,13 @@ def test_every_image_gets_a_pose_near_the_truth(walked: tuple[Walk, list[Initial
     assert max(p.reprojection_rms_px for p in poses) < 40.0
 
 
-def test_covariance_is_larger_along_the_ray(walked: tuple[Walk, list[InitialPose]]) -> None:
+def test_covariance_is_larger_along_the_ray(walked: tuple[Walk, list[LivePose]]) -> None:
     covariance = np.mean([p.covariance[1:] for p in walked[1]], axis=0)
     assert np.all(covariance[:, [0, 3, 5]] > 0.0)
     assert covariance[:, 5].mean() > 3.0 * covariance[:, 0].mean()
 
 
-def test_poses_are_deterministic_and_causal(walked: tuple[Walk, list[InitialPose]]) -> None:
+def test_poses_are_deterministic_and_causal(walked: tuple[Walk, list[LivePose]]) -> None:
     again = joints(LiveInitializer(), observed(FRAMES, covariance_px2=9.0)[:20])
     np.testing.assert_array_equal(again, [p.joints3d for p in walked[1][:20]])
 

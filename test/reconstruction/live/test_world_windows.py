@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,16 +17,17 @@ from drocap_ros.background import Background
 from drocap_ros.camera_path import CameraPath
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.metrics import pa_mpjpe
+from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import exp_so3, log_so3, quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.reconstruction.camera.fusion import Fusion, fuse_telemetry
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.live.adjuster import LiveAdjuster
+from drocap_ros.reconstruction.live.core import LiveCore, Step, live_results
 from drocap_ros.reconstruction.live.frame_buffer import StreamEvent
-from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
-from drocap_ros.reconstruction.live.latest_pose import LatestPlace, LatestPose, median_bone_lengths
-from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
-from drocap_ros.reconstruction.live.window import TelemetryUse
+from drocap_ros.reconstruction.live.initializer import LiveInitializer, LivePose
+from drocap_ros.reconstruction.live.window import AdjustedWindow, TelemetryUse
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.tracks import Tracks
 
@@ -34,11 +36,10 @@ ADJUSTER = BundleAdjusterConfig()
 #: Half the windows, where the last one counts.
 SELDOM = BundleAdjusterConfig(period_s=2.0)
 #: Poses of streams that were lifted before, by all their images so far, which it keeps alive.
-LIFTED: dict[int, tuple[InitialPose | None, StreamEvent, PoseObservation]] = {}
-CameraAt = Callable[[np.ndarray, tuple[int, int]], CameraPath | None]
+LIFTED: dict[int, tuple[LivePose | None, StreamEvent, PoseObservation]] = {}
 
 
-class Remembering:
+class Remembering(LiveInitializer):
     """An initializer that lifts no stream twice: telemetry, of which these tests are, does not change its poses."""
 
     event: StreamEvent
@@ -47,7 +48,7 @@ class Remembering:
         self._config, self._past, self._key = config, list[PoseObservation](), 0
         self._own: LiveInitializer | None = None
 
-    def push(self, observation: PoseObservation) -> InitialPose | None:
+    def push(self, observation: PoseObservation) -> LivePose | None:
         self._key = hash((self._key, id(observation)))
         if self._key not in LIFTED:
             if self._own is None:
@@ -60,22 +61,21 @@ class Remembering:
         return pose
 
 
-@pytest.fixture(autouse=True)
-def lifted_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drocap_ros.reconstruction.live.replay.LiveInitializer", Remembering)
-
-
 def run(
     observations: list[PoseObservation],
-    camera_at: CameraAt,
+    cameras: CameraHistory | None,
     adjuster: BundleAdjusterConfig = ADJUSTER,
     points_at: Callable[[np.ndarray], Background | None] | None = None,
-) -> list[LivePose | LiveWindow]:
-    return list(live_poses(observations, InitializerConfig(), adjuster, camera_at=camera_at, points_at=points_at))
+) -> list[Any]:
+    """Steps and windows."""
+    core = LiveCore(adjuster)
+    core.cameras = cameras or core.cameras
+    core.points = SimpleNamespace(along=points_at, newest_ns=0) if points_at else core.points  # type: ignore[assignment]
+    return list(live_results(observations, Remembering(InitializerConfig()), core, LiveAdjuster(adjuster), delay_s=0.0))
 
 
-def windows_of(results: list[LivePose | LiveWindow]) -> list[LiveWindow]:
-    return [r for r in results if isinstance(r, LiveWindow)]
+def windows_of(results: list[Any]) -> list[AdjustedWindow]:
+    return [r[1] for r in results if not isinstance(r, Step)]
 
 
 @lru_cache(maxsize=1)
@@ -84,14 +84,14 @@ def flown() -> Orbit:
 
 
 @lru_cache(maxsize=1)
-def followed() -> list[LivePose | LiveWindow]:
-    return run(flown().observations, flown().history(keep_s=60.0).along)
+def followed() -> list[Any]:
+    return run(flown().observations, flown().history(keep_s=60.0))
 
 
 @lru_cache(maxsize=1)
-def without_telemetry() -> LiveWindow:
+def without_telemetry() -> AdjustedWindow:
     """The last window of the same flight when no pose of the camera arrives."""
-    return windows_of(run(flown().observations, lambda *_: None, SELDOM))[-1]
+    return windows_of(run(flown().observations, None, SELDOM))[-1]
 
 
 def errors(poses: dict[int, np.ndarray], truth: Orbit) -> WorldErrors:
@@ -100,23 +100,23 @@ def errors(poses: dict[int, np.ndarray], truth: Orbit) -> WorldErrors:
     return world_errors(np.array([poses[s] for s in stamps], float), truth.truth[[place[s] for s in stamps]], FPS)
 
 
-def newest(windows: list[LiveWindow]) -> dict[int, np.ndarray]:
-    return {int(s): j for w in windows for s, j in zip(w.window.stamp_ns, w.joints3d, strict=True)}
+def newest(windows: list[AdjustedWindow]) -> dict[int, np.ndarray]:
+    return {int(s): j for w in windows for s, j in zip(w.stamp_ns, w.joints3d, strict=True)}
 
 
 def test_windows_with_telemetry_are_in_map_and_as_near_the_truth_as_offline() -> None:
     windows = windows_of(followed())
-    use = [w.window.telemetry for w in windows]
+    use = [w.telemetry for w in windows]
     # Too short at first, then without a measured scale.
     assert use[0] is TelemetryUse.LATE
     first = use.index(TelemetryUse.USED)
     assert first < 12
     assert set(use[first:]) == {TelemetryUse.USED}
-    found = [w for w in windows if w.window.in_map is not None]
+    found = [w for w in windows if w.in_map is not None]
     for w in found:
-        assert w.window.in_map is not None
-        assert len(w.window.stamp_ns) == len(w.joints3d) == len(w.window.covariance) == len(w.window.in_map.rotation)
-        assert np.linalg.norm(w.window.in_map.correction[:3]) < 0.2
+        assert w.in_map is not None
+        assert len(w.stamp_ns) == len(w.joints3d) == len(w.covariance) == len(w.in_map.rotation)
+        assert np.linalg.norm(w.in_map.correction[:3]) < 0.2
     live = errors(newest(found), flown())
     o = flown().observations
     tracks = Tracks(
@@ -135,11 +135,11 @@ def test_windows_with_telemetry_are_in_map_and_as_near_the_truth_as_offline() ->
 
 
 def test_a_window_continues_the_one_before_without_a_step() -> None:
-    found = [w for w in windows_of(followed()) if w.window.in_map is not None]
+    found = [w for w in windows_of(followed()) if w.in_map is not None]
     steps, changes = [], []
     for before, after in itertools.pairwise(found):
-        same, _, there = np.intersect1d(before.window.stamp_ns, after.window.stamp_ns, return_indices=True)
-        here = np.searchsorted(before.window.stamp_ns, same)
+        same, _, there = np.intersect1d(before.stamp_ns, after.stamp_ns, return_indices=True)
+        here = np.searchsorted(before.stamp_ns, same)
         gap = np.linalg.norm(after.joints3d[there] - before.joints3d[here], axis=-1).max(axis=1)
         steps.append(gap[:2].max())
         changes.append(gap[2:].max())
@@ -157,7 +157,7 @@ def test_findings_are_carried_from_window_to_window() -> None:
     at = np.minimum(np.arange(len(joints)), stop)
     sway = 0.002 * np.sin(np.arange(len(joints)))[:, None]
     hover = replace(still, rotation=still.rotation[at], position=still.position[at] + sway)
-    camera_at = hover.history(keep_s=60.0).along
+    cameras = hover.history(keep_s=60.0)
     # The person is projected again, as the standing camera sees her.
     seen = (joints - hover.position[:, None]) @ np.swapaxes(hover.rotation, 1, 2)
     image = seen[..., :2] / seen[..., 2:] * np.diagonal(still.matrix)[:2] + still.matrix[:2, 2]
@@ -165,18 +165,18 @@ def test_findings_are_carried_from_window_to_window() -> None:
     stream = [
         replace(o, keypoints=p.astype(np.float32)) for o, p in zip(still.observations, image + noise, strict=True)
     ]
-    use = [w.window.telemetry for w in windows_of(run(stream, camera_at, SELDOM))]
+    use = [w.telemetry for w in windows_of(run(stream, cameras, SELDOM))]
     assert use[-1] is TelemetryUse.USED
     # Without the orbit before, the same last seconds measure no scale.
-    alone = [w.window.telemetry for w in windows_of(run(stream[stop:], camera_at, SELDOM))]
+    alone = [w.telemetry for w in windows_of(run(stream[stop:], cameras, SELDOM))]
     assert TelemetryUse.USED not in alone
     assert alone[-1] is TelemetryUse.UNSCALED
 
 
 def test_windows_fall_back_to_the_camera_when_telemetry_stops() -> None:
     history = flown().history(slice(0, round(7.0 * FPS)), keep_s=60.0)
-    windows = windows_of(run(flown().observations[: round(10.0 * FPS)], history.along))
-    use = {round(float(w.window.stamp_ns[-1] / S), 1): w.window for w in windows}
+    windows = windows_of(run(flown().observations[: round(10.0 * FPS)], history))
+    use = {round(float(w.stamp_ns[-1] / S), 1): w for w in windows}
     assert use[6.3].telemetry is TelemetryUse.USED
     for last in (8.3, 9.3):
         w = use[last]
@@ -202,8 +202,8 @@ def test_wrong_telemetry_is_refused_and_bends_no_body(kind: str) -> None:
         rotation, position = np.roll(rotation, late, axis=0), np.roll(position, late, axis=0)
         rotation[:late], position[:late] = rotation[late], position[late]
     history = replace(true, rotation=rotation, position=position).history(keep_s=60.0)
-    windows = windows_of(run(true.observations, history.along, SELDOM))
-    last = windows[-1].window
+    windows = windows_of(run(true.observations, history, SELDOM))
+    last = windows[-1]
     assert last.telemetry is TelemetryUse.REFUSED
     assert last.in_map is None
     assert {"yaw": "foot", "frozen": "stopped", "other time": "feet"}[kind] in last.reason
@@ -221,7 +221,7 @@ def test_poses_that_stop_are_refused_even_when_no_window_remembers_the_motion() 
     rotation[stop:], position[stop:] = rotation[stop], position[stop]
     history = replace(true, rotation=rotation, position=position).history(keep_s=60.0)
     # A standing person looks like one who turns: her feet do not tell.
-    use = [w.window.telemetry for w in windows_of(run(true.observations, history.along))]
+    use = [w.telemetry for w in windows_of(run(true.observations, history))]
     assert TelemetryUse.USED in use[:7]
     assert set(use[8:]) == {TelemetryUse.REFUSED}
 
@@ -230,17 +230,15 @@ def test_fixed_points_measure_the_reports_and_correct_them_from_window_to_window
     true = flown()
     # Pitch, yaw and roll of a cheap gimbal.
     wrong = exp_so3(np.deg2rad([1.0, -2.0, 0.8]))
-    camera_at = replace(true, rotation=wrong @ true.rotation).history(keep_s=60.0).along
+    cameras = replace(true, rotation=wrong @ true.rotation).history(keep_s=60.0)
     begin_ns = true.stamp_ns[0]
-    with_points = run(true.observations, camera_at, points_at=true.points_at)
-    without = run(true.observations, camera_at, SELDOM)
-    found, blind = (
-        [w for w in windows_of(results) if w.window.in_map is not None] for results in (with_points, without)
-    )
-    assert (found[0].window.stamp_ns[-1] - begin_ns) * 1e-9 < 2.5
-    assert all(w.window.calibration for w in found)
-    assert not any(w.window.calibration for w in blind)
-    last = found[-1].window
+    with_points = run(true.observations, cameras, points_at=true.points_at)
+    without = run(true.observations, cameras, SELDOM)
+    found, blind = ([w for w in windows_of(results) if w.in_map is not None] for results in (with_points, without))
+    assert (found[0].stamp_ns[-1] - begin_ns) * 1e-9 < 2.5
+    assert all(w.calibration for w in found)
+    assert not any(w.calibration for w in blind)
+    last = found[-1]
     assert last.in_map is not None
     at = np.searchsorted(true.stamp_ns, last.stamp_ns)
     turned = log_so3(last.in_map.rotation @ np.swapaxes(true.rotation[at], 1, 2))
@@ -253,7 +251,7 @@ def test_fixed_points_measure_the_reports_and_correct_them_from_window_to_window
     def until(stamp_ns: np.ndarray) -> Background | None:
         return true.points_at(stamp_ns) if stamp_ns[-1] < dark_ns else None
 
-    after = [w.window for w in windows_of(run(true.observations, camera_at, SELDOM, until))]
+    after = windows_of(run(true.observations, cameras, SELDOM, until))
     assert {w.telemetry for w in after if w.stamp_ns[-1] > dark_ns} == {TelemetryUse.USED}
 
 
@@ -271,7 +269,7 @@ def test_reports_of_another_flight_are_refused_by_the_points_and_seldom_asked_ag
     # The same vehicle films the second subject: the pause goes on.
     half = len(true.observations) // 2
     stream = [replace(o, track_id=1 + (i >= half)) for i, o in enumerate(true.observations)]
-    windows = [w.window for w in windows_of(run(stream, other.history(keep_s=60.0).along, points_at=true.points_at))]
+    windows = windows_of(run(stream, other.history(keep_s=60.0), points_at=true.points_at))
     told = [w for w in windows if w.telemetry is not TelemetryUse.LATE]
     assert {w.telemetry for w in told} == {TelemetryUse.REFUSED}
     assert "turn otherwise" in told[0].reason
@@ -287,39 +285,28 @@ def test_another_subject_starts_without_the_findings_of_the_first() -> None:
     history = flown().history(keep_s=100.0)
     for stamp, position, turn in zip(second.stamp_ns.tolist(), second.position, second.rotation, strict=True):
         history.add_pose(stamp, position, quaternion_from_matrix(turn.T))
-    alone = windows_of(run(second.observations, history.along, SELDOM))
+    alone = windows_of(run(second.observations, history, SELDOM))
     first = flown().observations[: round(6.5 * FPS)]
-    both = windows_of(run([*first, *second.observations], history.along, SELDOM))
-    assert TelemetryUse.USED in [w.window.telemetry for w in both[: -len(alone)]]
+    both = windows_of(run([*first, *second.observations], history, SELDOM))
+    assert TelemetryUse.USED in [w.telemetry for w in both[: -len(alone)]]
     for a, b in zip(alone, both[-len(alone) :], strict=True):
-        assert a.window.telemetry is b.window.telemetry
+        assert a.telemetry is b.telemetry
         np.testing.assert_array_equal(a.joints3d, b.joints3d)
 
 
 def test_the_latest_pose_is_in_its_place_in_map() -> None:
-    true = flown()
-    history = true.history(keep_s=60.0)
-    lengths, latest = LatestPose(0.5), LatestPlace(0.5)
-    poses: dict[int, np.ndarray] = {}
-    for result in followed():
-        if isinstance(result, LiveWindow):
-            # Half a second later in the graph; at once here.
-            now = int(result.window.stamp_ns[-1])
-            lengths.set_solution(median_bone_lengths(result.window.joints3d), now)
-            latest.set_solution(result.window, now)
-            continue
-        o = result.observation
-        rigid = lengths.pose(o.stamp_ns, result.joints3d.astype(float))
-        camera = history.along(np.array([o.stamp_ns], np.int64))
-        placed = latest.place(o.stamp_ns, (rigid, result.pose.covariance), o.keypoints.astype(float), camera)
-        if placed is not None:
-            poses[o.stamp_ns] = placed.joints
-            assert placed.covariance.shape == (17, 6)
-    found = errors(poses, true)
-    assert len(poses) > 30
+    steps = [r for r in followed() if isinstance(r, Step)]
+    placed = {s.latest.stamp_ns: s.latest for s in steps if s.latest and s.latest.rotation is not None}
+    found = errors({stamp: pose.joints3d for stamp, pose in placed.items()}, flown())
+    assert len(placed) > 30
     assert found.absolute_mm < 250.0
-    # Without the camera's pose there is no place.
-    assert latest.place(o.stamp_ns, (rigid, result.pose.covariance), o.keypoints.astype(float), None) is None
-    unsolved = next(r.window for r in followed() if isinstance(r, LiveWindow) and r.window.in_map is None)
-    latest.set_solution(unsolved, o.stamp_ns)
-    assert latest.place(o.stamp_ns, (rigid, result.pose.covariance), o.keypoints.astype(float), camera) is None
+    assert all(pose.covariance.shape == (17, 6) for pose in placed.values())
+    # Without the camera's pose, and before a window is in the world, there is no place.
+    first_ns = next(w.stamp_ns[-1] for w in windows_of(followed()) if w.in_map is not None)
+    assert min(placed) > first_ns
+    end = round(10.5 * FPS)
+    blind = run(flown().observations[:end], flown().history(slice(0, round(10.0 * FPS)), keep_s=60.0))
+    last = [r.latest for r in blind if isinstance(r, Step)][-1]
+    assert last is not None
+    assert last.rotation is None
+    assert np.abs(last.joints3d[0]).max() < 1e-9
