@@ -85,4 +85,4 @@ def test_a_picture_that_waits_for_the_attitude_is_not_blamed(attitude_s, code):
 def test_a_subject_who_is_in_doubt_slows_the_orbit_down_at_once_and_is_named():
     doubted = changed(GOOD, subject_contradicted=True)
     assert allowed_pace(doubted, LIMITS)[1].code == _C.OTHER_SUBJECT
-    assert allowed_pace(doubted, LIMITS).pace < 0.5
+    assert allowed_pace(doubted, LIMITS)[0] < 0.5
