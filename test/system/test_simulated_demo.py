@@ -20,8 +20,8 @@ from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_vehicle_track
 from drocap_ros.simulation.flight_simulator.truth import load_flight_truth, orbit_quality
 
-#: What is allowed of what the page of figures says, and of W-MPJPE, mm, of the seeds 0 to 2 in 8 s.
-MARGIN, IN_THE_WORLD_MM = 1.3, 75.0
+#: What is allowed of what the page of figures says, and of W-MPJPE and the place of the pelvis of the seeds 0 to 2 in 8 s.
+MARGIN, IN_THE_WORLD_MM, PELVIS_M = 1.3, 75.0, 0.063
 
 
 def page(root):
@@ -82,7 +82,7 @@ def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_p
     # position that the vehicle tells has an error of its own.
     claimed, _ = interpolate(vehicle.stamp_ns, vehicle.position, motion.stamp_ns, spherical=False)
     off = motion.joints3d[:, 0] - truth.joints3d[exposure, 0] - (claimed - truth.camera_position[exposure])
-    assert np.nanmedian(np.linalg.norm(off, axis=1)) < 1.0
+    assert np.nanmedian(np.linalg.norm(off, axis=1)) < MARGIN * PELVIS_M
 
 
 def test_same_seed_gives_the_same_flight_while_the_processors_are_shared(tmp_path):
