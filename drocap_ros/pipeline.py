@@ -19,6 +19,7 @@ from drocap_ros.keypoints import PoseObservation
 from drocap_ros.motion import Motion
 from drocap_ros.open_images import open_images, refuse_other_inputs
 from drocap_ros.parameters import Values
+from drocap_ros.perception.calibration import with_lens_of
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.people import FoundPerson, find_persons, following, in_view
@@ -136,7 +137,7 @@ def input_tracks(
     origin.setdefault("images", {"size": list(tracks.image_size)})
     if found is not None:
         tracks, origin["telemetry"] = with_telemetry(path, tracks, telemetry, found, config.image_ingest, progress)
-    return with_attitude(tracks, telemetry.attitude_deg), origin
+    return with_attitude(with_lens_of(tracks, config.image_ingest), telemetry.attitude_deg), origin
 
 
 def with_origin(motion: Motion, path: Path, origin: Values, seconds: float) -> Motion:

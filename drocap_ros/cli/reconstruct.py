@@ -27,6 +27,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
 if TYPE_CHECKING:
+    from drocap_ros.config import DrocapConfig
     from drocap_ros.motion import Motion
     from drocap_ros.recording.video_telemetry import Telemetry
 
@@ -116,6 +117,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             " other)",
         )
     parser.add_argument(
+        "--level", action="store_true", help="the camera stands level: --camera-pitch 0 --camera-roll 0"
+    )
+    parser.add_argument("--height", metavar="M", type=float, help="the person's stature (default: 1.7, to 5 %%)")
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument("--fov", metavar="DEG", type=float, help="width of the camera's field of view")
+    lens.add_argument("--focal", metavar="PX", type=float, help="focal length in px of these images")
+    lens.add_argument(
+        "--calibration",
+        metavar="FILE",
+        type=Path,
+        help="lens: YAML of ROS camera_calibration or OpenCV, TOML of Pose2Sim (FILE#CAMERA); distortion is taken off",
+    )
+    parser.add_argument(
         "--rate",
         metavar="HZ",
         type=rate,
@@ -158,7 +172,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     names = output_names(args, out, clip)
     person, rule = parse_subject(args.subject if people is None else "")
     rule |= {"feet_model": args.feet} if args.feet else {}
-    config = load_config(args.config).replace("pose_estimator", **rule)
+    config = with_known(load_config(args.config), args).replace("pose_estimator", **rule)
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     telemetry = _telemetry(args)
@@ -218,12 +232,32 @@ def _telemetry(args: argparse.Namespace) -> Telemetry:
 
 
 def _attitude(args: argparse.Namespace) -> tuple[float, float] | None:
+    if args.level and (args.camera_pitch or args.camera_roll):
+        raise InputError("--level: expected neither --camera-pitch nor --camera-roll beside it; leave one of them out")
     if args.camera_pitch is None and args.camera_roll is None:
-        return None
+        return (0.0, 0.0) if args.level else None
     for axis, value, most in (("pitch", args.camera_pitch, 90.0), ("roll", args.camera_roll, 180.0)):
         if value is not None and not abs(value) <= most:
             raise InputError(f"--camera-{axis}: expected -{most:g} to {most:g} deg, got {value:g}; choose another")
     return args.camera_pitch or 0.0, args.camera_roll or 0.0
+
+
+def with_known(config: DrocapConfig, args: argparse.Namespace) -> DrocapConfig:
+    """The configuration with what the options say of person and lens."""
+    for name, value, low, high in (
+        ("--height", args.height, 0.5, 2.5), ("--fov", args.fov, 5.0, 170.0), ("--focal", args.focal, 10.0, 1e6)
+    ):  # fmt: skip
+        if value is not None and not low <= value <= high:
+            raise InputError(f"{name}: expected {low:g} to {high:g}, got {value:g}; correct it")
+    if args.height is not None:
+        config = config.replace("initializer", assumed_height_m=args.height)
+        config = config.replace("bundle_adjuster", stature_std=_MEASURED_STATURE)
+    lens = {"horizontal_fov_deg": args.fov, "focal_px": args.focal, "calibration_file": args.calibration}
+    given = {name: value for name, value in lens.items() if value is not None}
+    if given:
+        none = {"horizontal_fov_deg": 0.0, "focal_px": 0.0, "calibration_file": ""}
+        config = config.replace("image_ingest", **{**none, **given, "calibration_file": str(args.calibration or "")})
+    return config
 
 
 def _check_offset(name: str, value: float, args: argparse.Namespace, *, mount: bool) -> None:
@@ -238,6 +272,7 @@ def _check_offset(name: str, value: float, args: argparse.Namespace, *, mount: b
         raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
 
 
+_MEASURED_STATURE = 0.01  # relative deviation of a stature that somebody has measured: shoes, and the day
 #: Options of one recording, and their values where they are not given.
 _OF_ONE = {
     "method": "ba",
@@ -250,6 +285,10 @@ _OF_ONE = {
     "mount_pitch": None,
     "camera_pitch": None,
     "camera_roll": None,
+    "level": False,
+    "fov": None,
+    "focal": None,
+    "calibration": None,
     "evidence": None,
 }
 #: Of a camera without telemetry and fixed points that moves.
@@ -276,7 +315,7 @@ def run_together(args: argparse.Namespace) -> int:
     out = args.out or default_folder(args.input, "motion")
     names = output_names(args, out, clip_of(args))
     beside = [f"camera_{number}.npz" for number in range(2, len(inputs) + 1)]
-    config = load_config(args.config)
+    config = with_known(load_config(args.config), args)
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     with contextlib.ExitStack() as stack:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import re
+import sys
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.rotations import centred_camera
 from drocap_ros.perception.sources.base import ImageIngestConfig
-from drocap_ros.tracks import check_camera_matrix
+from drocap_ros.tracks import Tracks, check_camera_matrix
 
 #: Names of lens distortions that ``sensor_msgs/CameraInfo`` knows (``distortion_models.hpp`` of sensor_msgs).
 _MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
@@ -35,6 +38,17 @@ class CameraModel:
         """Whether images of ``size`` (width, height) px have the calibration's aspect ratio, to 2 %."""
         return abs(self.width * size[1] - self.height * size[0]) <= 0.02 * self.width * size[1]
 
+    def undistorted(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 2) px as a lens without distortion shows them; NaN stays."""
+        import cv2
+
+        seen, flat = np.isfinite(points).all(axis=1), np.full(points.shape, np.nan)
+        if seen.any():
+            undo = cv2.fisheye.undistortPoints if self.distortion_model == "equidistant" else cv2.undistortPoints
+            given = points[seen].astype(np.float64)[:, None]
+            flat[seen] = undo(given, self.matrix, self.distortion, P=self.matrix)[:, 0]
+        return flat
+
     def resized(self, width: int, height: int) -> CameraModel:
         """The same lens at another image size."""
         scale = np.array([width / self.width, height / self.height, 1.0])
@@ -51,35 +65,94 @@ def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraMode
                 f" {model.width}x{model.height}; calibrate with images of this camera mode"
             )
         return model.resized(*size)
+    focal = config.focal_px
     if config.horizontal_fov_deg > 0:
         focal = 0.5 * size[0] / np.tan(np.deg2rad(0.5 * config.horizontal_fov_deg))
+    if focal > 0:
         return CameraModel(*size, centred_camera(size, focal))
     return None
 
 
-def load_calibration(path: Path) -> CameraModel:
-    """Read the YAML of ROS's ``camera_calibration``."""
-    import yaml
+#: Where the formats keep a camera: ROS's ``camera_calibration``, OpenCV's samples, a table of Pose2Sim's TOML, whose
+#: ``size`` is width and height.
+_NAMES = {
+    "matrix": ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "matrix"),
+    "distortion": ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "distortions"),
+    "width": ("image_width", "image_Width", "width"),
+    "height": ("image_height", "image_Height", "height"),
+}
 
+
+def load_calibration(path: Path) -> CameraModel:
+    """Read a YAML of ROS's ``camera_calibration`` or of OpenCV, or a TOML of Pose2Sim.
+
+    path : of the file; of a TOML with several cameras ``FILE#NAME``
+    """
+    name = path.name.rpartition("#")[2] if "#" in path.name and not path.exists() else ""
+    file = path.with_name(path.name.rpartition("#")[0]) if name else path
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        matrix = np.array(data["camera_matrix"]["data"], float).reshape(3, 3)
-        distortion = np.array(data.get("distortion_coefficients", {}).get("data", []), float).ravel()
-        lens = str(data.get("distortion_model", "plumb_bob"))
-        model = CameraModel(int(data["image_width"]), int(data["image_height"]), matrix, distortion, lens)
+        data = _camera_table(file, file.read_text(encoding="utf-8"), name)
+        found: dict[str, Any] = {
+            kind: next((data[key] for key in keys if key in data), None) for kind, keys in _NAMES.items()
+        }
+        width, height = data["size"] if "size" in data else (found["width"], found["height"])
+        matrix = _numbers(found["matrix"]).reshape(3, 3)
+        distortion = _numbers([] if found["distortion"] is None else found["distortion"])
+        lens = "equidistant" if data.get("fisheye") else str(data.get("distortion_model", "plumb_bob"))
+        model = CameraModel(int(width), int(height), matrix, distortion, lens)
     except OSError as error:
         raise InputError(f"{path}: expected a calibration file; {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
-            f"{path}: expected image_width, image_height, camera_matrix as camera_calibration writes them;"
-            f" found a problem with {first_line(error)}"
+            f"{path}: expected image_width, image_height, camera_matrix as camera_calibration or OpenCV write them, or"
+            f" a camera of Pose2Sim's TOML; found a problem with {first_line(error)}"
         ) from None
     if lens not in _MODELS:
         raise InputError(f"{path}: distortion_model: expected one of {', '.join(_MODELS)}, found {lens!r}; correct it")
     if min(model.width, model.height) < 1:
         raise InputError(f"{path}: expected a positive image size, found {model.width}x{model.height}; correct it")
+    if not np.isfinite(distortion).all() or len(distortion) not in (0, 4, 5, 8, 12, 14):
+        raise InputError(f"{path}: expected 4, 5, 8, 12 or 14 finite distortion coefficients, found {distortion}")
     try:
         check_camera_matrix(matrix, (model.width, model.height))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return model
+
+
+def _camera_table(path: Path, text: str, name: str) -> dict[str, Any]:
+    """The one camera of a file; raises ValueError where it is none."""
+    import yaml
+
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+    if path.suffix.lower() != ".toml":
+        # OpenCV's header is no YAML of today, and its tag is one of its own.
+        try:
+            data = yaml.safe_load(re.sub(r"%YAML:.*|!!opencv-matrix", "", text))
+        except yaml.YAMLError as error:
+            raise ValueError(error) from None
+        return dict(data)
+    tables = {key: value for key, value in tomllib.loads(text).items() if isinstance(value, dict) and "matrix" in value}
+    if name in tables or (not name and len(tables) == 1):
+        return dict(tables[name] if name else next(iter(tables.values())))
+    raise InputError(f"{path}: expected one camera, found {', '.join(tables) or 'none'}; name it: {path.name}#NAME")
+
+
+def _numbers(value: Any) -> np.ndarray:
+    return np.array(value["data"] if isinstance(value, dict) else value, float).ravel()
+
+
+def with_lens_of(tracks: Tracks, config: ImageIngestConfig) -> Tracks:
+    """Tracks whose lens nothing told, with the configured one; its distortion is taken off keypoints and points."""
+    if tracks.camera_matrix is not None or (camera := camera_model(config, tracks.image_size)) is None:
+        return tracks
+    background = tracks.background
+    if camera.distortion.any():
+        flat = camera.undistorted(tracks.keypoints.reshape(-1, 2)).reshape(tracks.keypoints.shape)
+        if background is not None:
+            background = replace(background, point=camera.undistorted(background.point).astype(background.point.dtype))
+        tracks = replace(tracks, keypoints=flat, background=background)
+    return replace(tracks, camera_matrix=camera.matrix)

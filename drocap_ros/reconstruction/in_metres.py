@@ -56,7 +56,7 @@ class Body:
 
 def as_seen(camera: CameraPath) -> CameraPath:
     """The camera as far as a method may see it: a rotation whose up is unsure bends bodies."""
-    return camera if camera.errors is not None else dataclasses.replace(camera, rotation=None, position=None)
+    return camera if camera.upright else dataclasses.replace(camera, rotation=None, position=None)
 
 
 def by_place(camera: CameraPath) -> bool:
@@ -94,12 +94,10 @@ def in_metres(keypoints: Keypoints2D, poses: ImagePoses, camera: CameraPath, set
         placed = WorldPoses(about, False, "assumed_height", None)
     else:
         rotation, frame = camera.rotation, "world"
-        expected = None if camera.errors is None else config_of(camera, config)
-        placed, refined, refusal = in_world(camera, keypoints, poses, per_px, expected)
+        seen = poses if camera.matrix is None or not by_place(camera) else aside(poses, camera.matrix)
+        placed, refined, refusal = in_world(camera, keypoints, seen, per_px, config_of(camera, config))
         if refusal is not None:
             return refusal
-        if camera.errors is None:  # the body stays as it is seen
-            placed = dataclasses.replace(placed, joints=placed.joints[:, :1] + about @ rotation)
     if camera.teller in (Teller.PICTURE, Teller.PERSON):
         metric = placed.metric and camera.metric
         placed = dataclasses.replace(placed, metric=metric, scale_source=camera.scale_source)

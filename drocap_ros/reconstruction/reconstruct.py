@@ -159,12 +159,15 @@ def body_poses(
     Up and metres of such a path come from poses that know neither; then the lifter sees the camera's rotation, where up
     is sure.
     """
-    if camera.rotation is not None:
+    attitude = camera.rotation
+    if camera.position is not None or (attitude is not None and camera.matrix is None):
         return _solve(tracks, keypoints, camera, settings), camera
     unknown = dataclasses.replace(camera, matrix=None) if camera.lens == "assumed" else camera
     found = picture_camera(unknown, tracks.background, tracks.image_size)
     if found is not None:
         camera = _of_picture(camera, found)
+    elif attitude is not None:  # without a path the body stays at the origin
+        return _solve(tracks, keypoints, camera, settings), camera
     poses = _solve(tracks, keypoints, as_seen(camera), settings)
     if camera.rotation is None:
         return poses, camera
@@ -172,7 +175,7 @@ def body_poses(
     height_m, raw = settings.initializer.assumed_height_m, camera
     per_px = metres_per_px(poses.joints_px, camera.stamp_ns, height_m)
     camera = with_camera(raw, aside(poses, camera.matrix) if by_place(raw) else poses, per_px)
-    if camera.errors is None:
+    if not camera.upright:
         return poses, camera
     poses = _solve(tracks, keypoints, camera, settings)
     if camera.points_tell_up:

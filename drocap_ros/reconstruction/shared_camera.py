@@ -31,18 +31,17 @@ def shared(motion: Motion, camera: CameraPath) -> CameraPath | None:
     if motion.frame != "world" or motion.camera_position is None or camera.matrix is None:
         return None
     by_picture = camera.teller is Teller.PICTURE
-    sure = not by_picture or camera.errors is not None
     covariance = None if by_picture else camera.covariance
     return replace(
         camera.moved(motion.camera_rotation, motion.camera_position),
         teller=Teller.PERSON,
-        errors=_HELD if sure else None,
+        errors=_HELD,
         covariance=covariance,
         scale_std=None,
         metric=motion.metric,
         scale_source=motion.scale_source,
         corrected=False,
-        points_tell_up=sure and (by_picture or covariance is not None),
+        points_tell_up=camera.upright and (by_picture or covariance is not None),
         measured=None,
         feet=_lower_ankle(motion.joints3d),
     )

@@ -38,11 +38,12 @@ class ImageIngestConfig(Parameters):
         10.0, "longest pause between attempts to reconnect to a live source", unit="s", minimum=0.1, maximum=600
     )
     calibration_file: str = param(
-        "", "camera calibration YAML (camera_calibration format), whose distortion is not removed; empty: none"
+        "", "calibration: YAML of camera_calibration or OpenCV, TOML of Pose2Sim (FILE#CAMERA); empty: none"
     )
     horizontal_fov_deg: float = param(
         0.0, "horizontal field of view where there is no calibration; 0 = unknown", unit="deg", minimum=0, maximum=170
     )
+    focal_px: float = param(0.0, "focal length of these images instead; 0 = unknown", unit="px", minimum=0, maximum=1e6)
     frame_id: str = param("camera_optical", "optical frame of the images")
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.background import Background
-from drocap_ros.camera_path import CameraErrors, CameraPath, UpSource
-from drocap_ros.geometry.rotations import pack_covariance
-from drocap_ros.reconstruction.camera.from_picture import camera_from_points
+from drocap_ros.camera_path import CameraErrors, CameraPath, Kind, PictureFacts, Teller, UpSource
+from drocap_ros.geometry.rotations import centred_camera, pack_covariance
+from drocap_ros.reconstruction.camera.from_picture import FOCAL_SHARE, camera_from_points
 from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ
 from drocap_ros.reconstruction.camera.upright import set_upright
 from drocap_ros.reconstruction.common.poses import ImagePoses
@@ -24,10 +24,9 @@ from drocap_ros.reconstruction.world.refine import RefinedWorld
 _TURNED_DEG = 0.02
 _LATENCY_S = 1e-3
 HELD_M = 0.02
+#: Least deviation (deg) of an attitude that is told: a person reads it off a tripod, or a phone.
+_TOLD_DEG = 1.0
 _ATTITUDE_DEG = 0.05
-#: Deviation (deg) of up below which the lifter sees it and the body is adjusted with it.  Ground under the feet
-#: has 0.5, feet alone 3: with such an up the knees of a still camera's video were bent by 8 degrees more than without.
-_SURE_UP_DEG = 2.0
 #: Largest standard deviation of the logarithm of a path's scale, before body and camera are adjusted together.
 _SCALE_STD = 0.3
 
@@ -35,10 +34,37 @@ _SCALE_STD = 0.3
 def picture_camera(camera: CameraPath, points: Background | None, size: tuple[int, int]) -> CameraPath | None:
     """The camera of images of ``size`` by their fixed points, in a unit and axes of its own.
 
-    None where there are none, or too few images.
+    None where there are none, or too few images.  An attitude that is known without a place tells up in these axes; a
+    camera whose attitude stays stands, where no points say what it does.
     """
-    if points is None or len(camera.stamp_ns) < LEAST_FRAMES:
+    if len(camera.stamp_ns) < LEAST_FRAMES:
         return None
+    attitude = camera.rotation
+    found = None if points is None else _by_points(camera, points, size)
+    if attitude is None or (found is not None and found.picture is not None and found.picture.kind.known):
+        return found if attitude is None or found is None else with_told(found, attitude, camera.errors)
+    if not np.allclose(attitude, attitude[0]):
+        return None
+    matrix = centred_camera(size, FOCAL_SHARE * max(size)) if camera.matrix is None else camera.matrix
+    stands = PictureFacts(Kind.STANDS, residual_px=0.0, covered=1.0)
+    still = camera.moved(np.broadcast_to(np.eye(3), attitude.shape), np.zeros((len(attitude), 3)))
+    still = replace(
+        still, teller=Teller.PICTURE, metric=False, scale_source="assumed_height", picture=stands, matrix=matrix
+    )
+    return with_told(still, attitude, camera.errors)
+
+
+def with_told(found: CameraPath, attitude: np.ndarray, errors: CameraErrors | None) -> CameraPath:
+    """The picture's camera with what its attitude (F, 3, 3) world -> camera, known to ``errors``, tells of up."""
+    assert found.rotation is not None
+    assert found.picture is not None
+    up = np.einsum("fji,fj->i", found.rotation, attitude[:, :, 2])
+    std_deg = max((errors or CameraErrors()).tilt_deg, _TOLD_DEG)
+    picture = replace(found.picture, told=up / np.linalg.norm(up), told_std_deg=std_deg)
+    return replace(found, picture=picture)
+
+
+def _by_points(camera: CameraPath, points: Background, size: tuple[int, int]) -> CameraPath:
     slot, fps = even_slots(camera.stamp_ns)
     seen = slot[points.frame], points.track, points.point.astype(np.float64)
     found = camera_from_points(*seen, fps, int(slot[-1]) + 1, size, camera.matrix)
@@ -59,20 +85,19 @@ def with_camera(camera: CameraPath, poses: ImagePoses, per_px: np.ndarray) -> Ca
     # What feet have measured the adjustment measures better, from the same feet: no prior counts them twice.
     scale_std = _SCALE_STD if facts.feet_tell else min(facts.scale_std, _SCALE_STD)
     # Steps of the path err independently and add up to an error that wanders: resting feet and the body's size tell it.
-    errors = CameraErrors(_TURNED_DEG, _TURNED_DEG, _LATENCY_S, attitude_wander_deg=_ATTITUDE_DEG)
+    tilt_deg = max(facts.up_std_deg, _TURNED_DEG)
+    errors = CameraErrors(tilt_deg, _TURNED_DEG, _LATENCY_S, attitude_wander_deg=_ATTITUDE_DEG)
     step_m = float(np.nan_to_num(metres_per_unit(camera, position) * raw.position_std))
     wander_m = step_m * float(np.sqrt(0.5 * KNOTS_HZ * errors.position_wander_s))
     errors = replace(errors, position_wander_m=max(HELD_M, wander_m))
-    sure = facts.up_std_deg < _SURE_UP_DEG
+    found = replace(world, errors=errors, up_std_deg=facts.up_std_deg)
     return replace(
-        world,
-        errors=errors if sure else None,
+        found,
         covariance=_covariance(camera, position),
         scale_std=scale_std if np.isfinite(facts.scale_std) else None,
         corrected=True,
-        points_tell_up=sure and facts.up is UpSource.GROUND,
+        points_tell_up=found.upright and facts.up is UpSource.GROUND,
         words=facts.meta(world.matrix),
-        up_std_deg=facts.up_std_deg,
     )
 
 

@@ -71,11 +71,13 @@ _LEVEL_STD_DEG = 3.0
 #: Least standard deviation of the scale by a body's distance from the camera: the lifter's sizes.
 LEAST_SCALE_STD = 0.04
 #: Standard deviation (degrees) of the body's mean direction from the vertical: people lean, and the lifter does.
-_BODY_STD_DEG = 5.0
+_BODY_STD_DEG = 3.0
 #: Angle (degrees) from the mean at which one frame's direction has half its weight.
 _LEANS_DEG = 15.0
 #: Standard deviation (m) of a resting foot's height, and independent ones per second: a foot rests for half a second.
-_FOOT_STD_M = 0.05
+_FOOT_STD_M = 0.15
+#: Size (m) of a place: a foot's length.
+_PLACE_M = 0.6
 FEET_HZ = 2.0
 #: The same of a point of the ground, and distance (m) from the feet up to which points count.
 _GROUND_STD_M = 0.1
@@ -129,6 +131,9 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
     points = facts.points
     from_camera = seen @ rotation
     up, std_deg = body_up(from_camera)
+    source = UpSource.BODY
+    if facts.told is not None and facts.told_std_deg < std_deg:
+        up, std_deg, source = facts.told, facts.told_std_deg, UpSource.TOLD
     feet = from_camera[:, ANKLES]
     factor, factor_std, level, feet_tell = 1.0, float("nan"), None, False
     if np.ptp(position, axis=0).any():
@@ -141,13 +146,13 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
         )
     path, lying = factor * position, points * np.array([factor] * 3 + [1.0])
     feet = path[:, None] + feet
-    plane, source = _Plane(up, 0.0, np.deg2rad(std_deg) ** 2 * np.eye(2)), UpSource.BODY
+    plane = _Plane(up, 0.0, np.deg2rad(std_deg) ** 2 * np.eye(2))
     by_feet = _by_feet(plane, feet, stamp_ns)
     # The tilt of feet on one line is known along it alone: half of the prior's variance stays.
     if np.trace(by_feet.covariance) < 0.75 * np.trace(plane.covariance):
         source = UpSource.FEET
     plane = by_feet
-    if level is not None:
+    if level is not None and source is not UpSource.TOLD:
         begun = _Plane(level.up, factor * level.height + _ANKLE_M, np.deg2rad(_LEVEL_STD_DEG) ** 2 * np.eye(2))
         plane, source = _by_points(begun, feet, lying) or begun, UpSource.GROUND
     turn = _axes(plane.up, rotation[0])
@@ -238,10 +243,12 @@ def resting(feet: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
 
 
 def _by_feet(prior: _Plane, feet: np.ndarray, stamp_ns: np.ndarray) -> _Plane:
-    """The plane of resting feet; frames of one rest count once."""
-    weight = resting(feet, stamp_ns).reshape(-1)
-    seconds = max(float(stamp_ns[-1] - stamp_ns[0]) * 1e-9, 1e-3)
-    return _fit(prior, feet.reshape(-1, 3), weight * min(FEET_HZ * seconds / len(feet), 1.0), _FOOT_STD_M)
+    """The plane of resting feet; all rests on one place count once: what errs there errs every time."""
+    weight, places = resting(feet, stamp_ns).reshape(-1), feet.reshape(-1, 3)
+    cells = np.floor(places @ _two_across(prior.up).T / _PLACE_M).astype(int)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    rests = np.bincount(cell.reshape(-1), weight)
+    return _fit(prior, places, weight / np.maximum(rests, 1.0)[cell.reshape(-1)], _FOOT_STD_M)
 
 
 def _by_points(plane: _Plane, feet: np.ndarray, points: np.ndarray) -> _Plane | None:

@@ -157,8 +157,9 @@ class PictureOdometry:
             self._pause("neither feet nor ground give its metres", w)
             return None
         camera = replace(camera, covariance=None)  # of this window alone
-        if camera.errors is not None:  # corrected by each window alone, the path would not be one
-            camera = replace(camera, errors=replace(camera.errors, position_wander_m=HELD_M))
+        assert camera.errors is not None
+        # Corrected by each window alone, the path would not be one.
+        camera = replace(camera, errors=replace(camera.errors, position_wander_m=HELD_M))
         self._number, self._retry = self._number + 1, Retry()
         unit_m = metres_per_unit(raw, camera.pose[1])
         drift = np.nan_to_num([unit_m * facts.position_std, np.deg2rad(facts.turn_std_deg)]) * np.sqrt(KNOTS_HZ)

@@ -97,7 +97,7 @@ class PictureWindows:
         rotation, position = camera.pose
         per_px = person.metres_per_px(camera)
         refined = None
-        if camera.errors is not None:
+        if camera.upright:
             config = self._chain.steps(config_of(camera, self._config), camera.stamp_ns)
             refined = self._chain.refined(camera, keypoints, poses, per_px, config)
         if isinstance(refined, RefinedWorld):

@@ -75,7 +75,7 @@ class View:
                 # Of reports the camera before the adjustment: its errors are to be found with all views.
                 camera = camera.moved(motion.camera_rotation, motion.camera_position)
             view = View(solved, motion.joints3d[:, :17], camera, True, _STANDING)
-            if camera.errors is not None:
+            if camera.upright:
                 config = config_of(camera, world_config(solved.settings.adjuster))
                 return replace(view, config=replace(config, checks=False))
             # A path whose up is unsure was not adjusted with the body: it errs as any that moves.

@@ -61,7 +61,7 @@ def view_weights(view: WorldInput) -> ViewWeights:
         first[:3] = fact / (fact / first[:3] + view.placed_m**2)
     return ViewWeights(
         acceleration=(errors.acceleration_m_s2 / fps**2) ** -2,
-        depth=config.depth_weight / np.maximum(view.depth_sigma, 0.01),
+        depth=1.0 / np.maximum(view.depth_sigma, 0.01),
         wander=fact * wander,
         first=first,
     )

@@ -104,7 +104,6 @@ class WorldConfig:
     errors : of the camera; rough positions wander farther
     corrected : the camera's path is one that fixed points have corrected
     acceleration_m_s2 : ordinary one of a joint
-    depth_weight : of the lifter's depths
     contact_weight, locked_weight : of feet in contact, less than 1 as contacts last for some frames, and of locked ones
     contact_speed_m_s : standard deviation of the speed of a foot in contact
     feet : whether feet in contact keep their place
@@ -119,7 +118,6 @@ class WorldConfig:
     errors: CameraErrors = field(default_factory=CameraErrors)
     corrected: bool = False
     acceleration_m_s2: float = 16.0
-    depth_weight: float = 0.2
     contact_weight: float = 0.2
     locked_weight: float = 2.0
     contact_speed_m_s: float = 0.1
