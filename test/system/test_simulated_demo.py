@@ -20,7 +20,7 @@ from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_vehicle_track
 from drocap_ros.simulation.flight_simulator.truth import load_flight_truth, orbit_quality
 
-#: What is allowed of the figures of the page, of W-MPJPE, mm, and of the place of the pelvis, m: of seeds 0 to 2 in 8 s.
+#: What is allowed of the figures of the page, of W-MPJPE, mm, and of the pelvis, m: of seeds 0 to 2 in 8 s.
 MARGIN, IN_THE_WORLD_MM, PELVIS_M = 1.3, 75.0, 0.063
 
 
