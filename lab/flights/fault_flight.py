@@ -20,7 +20,7 @@ from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 FAULT_S = 14.0
 MOTION_S, EXCURSION_M = 0.5, 2.5
 _WATCH_S = 7.0
-_LEAST_DISTANCE_M = 3.0
+_LEAST_DISTANCE_M, _LEAST_HEIGHT_M = 3.0, 1.2
 
 Injection = Callable[[OrbitLoop], None]
 
@@ -32,6 +32,7 @@ class FaultResult(NamedTuple):
     excursion_m : horizontal, from the position at that instant
     speed_m_s : flown at that instant, or commanded by the last setpoint: the greater
     least_distance_m : to the person, after the fault
+    least_height_m : true, above his ground, after the fault, while the autopilot followed us
     resumed : whether motion was commanded again without the operator
     evident : whether the case's cause ended the motion
     violation : the additional requirement that failed, in words; "" = none
@@ -41,6 +42,7 @@ class FaultResult(NamedTuple):
     excursion_m: float
     speed_m_s: float
     least_distance_m: float
+    least_height_m: float
     resumed: bool
     evident: bool
     violation: str
@@ -172,7 +174,7 @@ def inject_fault(fault: Fault, loop: OrbitLoop) -> FaultResult:
         loop.run(FAULT_S + after_s, record)
         inject(loop)
     loop.run(FAULT_S + fault.watch_s, record)
-    rows = loop.rows[observable:]
+    rows, control = loop.rows[observable:], loop.copter.kind.control_mode
     actions = [row.action for row in loop.rows[injected:]]
     orbiting = [i for i, action in enumerate(actions) if action == Action.ORBIT]
     ended = next((i for i, action in enumerate(actions) if action != Action.ORBIT), len(actions))
@@ -183,6 +185,7 @@ def inject_fault(fault: Fault, loop: OrbitLoop) -> FaultResult:
         excursion_m=max(float(np.linalg.norm(row.position[:2] - position[:2])) for row in rows),
         speed_m_s=speed,
         least_distance_m=min(row.distance_m for row in rows),
+        least_height_m=min((float(row.position[2]) for row in rows if row.mode == control), default=np.inf),
         resumed=Action.ORBIT in actions[ended:],
         evident=fault.cause is None or fault.cause.acted(flight),
         violation=fault.check(loop),
@@ -200,6 +203,8 @@ def failures(fault: Fault, autopilot: str, result: FaultResult) -> list[str]:
         found.append(f"the condition is not {' or '.join(code.name for code in fault.codes)}")
     if result.least_distance_m <= _LEAST_DISTANCE_M:
         found.append(f"distance to the person of {result.least_distance_m:.2f} m")
+    if result.least_height_m < _LEAST_HEIGHT_M:
+        found.append(f"height of {result.least_height_m:.2f} m")
     if fault.harmless:
         return found
     bounds = fault.bounds(autopilot, result.speed_m_s)

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from rendered_person import rendered_images
 
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import SIMULATION, models_folder
+from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 pytest.importorskip("onnxruntime")
@@ -192,3 +194,19 @@ def test_subject_survives_a_somersault_under_constant_shedding(shared):
         assert {o.track_id for o in observations} == {1}
         boxes[load_level] = np.array([o.roi for o in observations])
     assert (iou_per_image(boxes[0], boxes[3]) > 0.3).mean() > 0.9
+
+
+def test_a_box_that_moves_out_of_the_image_ends_at_its_border():
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    image = cv2.GaussianBlur(noise, (0, 0), 3) * 4  # a texture to follow
+    joints = np.stack([np.linspace(30, 110, 15), np.linspace(60, 200, 15)], axis=1).astype(np.float32)
+    before = PoseObservation(
+        0, 1, (320, 240), roi=np.array([2, 40, 122, 220], np.float32), keypoints=joints,
+        covariance=np.ones((15, 3), np.float32), confidence=np.ones(15, np.float32),
+    )  # fmt: skip
+    flow = KeypointFlow()
+    flow.start(image, before)
+    after = flow.propagate(np.roll(image, -6, axis=1), STEP_NS)
+    assert np.nanmedian(after.keypoints[:, 0] - joints[:, 0]) == pytest.approx(-6.0, abs=0.5)
+    assert after.roi[0] == 0.0
+    assert after.roi[2] == pytest.approx(116.0, abs=0.5)

@@ -20,13 +20,27 @@ from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_vehicle_track
 from drocap_ros.simulation.flight_simulator.truth import load_flight_truth, orbit_quality
 
+#: What is allowed of the figures of the page, of W-MPJPE, mm, and of the pelvis, m: of seeds 0 to 2 in 8 s.
+MARGIN, IN_THE_WORLD_MM, PELVIS_M = 1.3, 75.0, 0.063
 
-def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_path, capsys):
-    out = tmp_path / "demo"
-    assert main(["demo", "--seconds", "8", "--seed", "1", "--out", str(out), "--quiet"]) == 0
-    printed = capsys.readouterr().out
-    # A person who holds every joint right but the depth of one arm is 60 mm off; depth = 0 would give 125.
-    assert float(re.search(r"truth: ([\d.]+) mm", printed)[1]) < 90
+
+def page(root):
+    """Means of the live and of the reconstruction's error, mm, over the seeds of docs/figures/demo.md."""
+    rows = [line.split("|") for line in (root / "docs" / "figures" / "demo.md").read_text().splitlines()]
+    errors = [(float(row[9]), float(row[10])) for row in rows if len(row) > 10 and row[1].strip() == "ardupilot"]
+    return np.mean(errors, axis=0)
+
+
+def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_path, capsys, root):
+    errors = []
+    for seed in (0, 1):
+        out = tmp_path / str(seed) / "demo"
+        assert main(["demo", "--seconds", "8", "--seed", str(seed), "--out", str(out), "--quiet"]) == 0
+        printed = capsys.readouterr().out
+        found = [re.search(words + r" ([\d.]+) mm", printed)[1] for words in ("poses, error", "truth:", "W-MPJPE")]
+        errors.append([float(number) for number in found])
+    live, reconstructed = page(root)
+    assert np.all(np.mean(errors, axis=0) < MARGIN * np.array([live, reconstructed, IN_THE_WORLD_MM])), errors
     assert {path.name for path in out.iterdir()} == {
         "motion.npz", "truth.npz", "report.html", "session",
     }  # fmt: skip
@@ -51,7 +65,6 @@ def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_p
     ]  # fmt: skip
     assert int(figures[4]) > 100
     assert int(figures[5]) > 50
-    assert float(figures[6]) < 120
     assert counts["/drocap/image/compressed"] >= counts["/drocap/pose2d"]
     # The first pictures are older than the first telemetry.
     assert len(motion.stamp_ns) > counts["/drocap/pose2d"] - 30
@@ -69,7 +82,7 @@ def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_p
     # position that the vehicle tells has an error of its own.
     claimed, _ = interpolate(vehicle.stamp_ns, vehicle.position, motion.stamp_ns, spherical=False)
     off = motion.joints3d[:, 0] - truth.joints3d[exposure, 0] - (claimed - truth.camera_position[exposure])
-    assert np.nanmedian(np.linalg.norm(off, axis=1)) < 1.0
+    assert np.nanmedian(np.linalg.norm(off, axis=1)) < MARGIN * PELVIS_M
 
 
 def test_same_seed_gives_the_same_flight_while_the_processors_are_shared(tmp_path):

@@ -14,7 +14,7 @@ from drocap_ros.flight.autopilot.px4 import PX4
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.commands import CommandQueue, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.mavlink.parser import MavlinkParser, Packer
 from drocap_ros.flight.mavlink.transport import LinkError
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.vehicle import ned_to_enu
@@ -249,3 +249,10 @@ def test_the_settings_are_those_of_the_autopilot_that_is_heard_now():
             channel.write(packet.pack(vehicle))
         receiver.spin_once()
         assert receiver.settings.loss_settings()[:2] == (name, 0.5)
+
+
+def test_the_packets_of_each_stream_are_numbered_one_by_one():
+    """An autopilot and a router count what is lost by these numbers."""
+    packer, message = Packer(1, 191, None, 0, 0), mavlink.MAVLink(None).ping_encode(0, 0, 1, 1)
+    numbers = [packer.pack(message, 10**18 + i, 0)[4] for i in range(600)]
+    assert numbers == [i % 256 for i in range(600)]

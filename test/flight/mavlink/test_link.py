@@ -17,7 +17,7 @@ from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.commands import TELEMETRY
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.parser import MavlinkParser, Packer
+from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.vehicle import camera_rotation
@@ -370,10 +370,3 @@ def test_heartbeats_go_on_where_the_simulated_time_goes_back(port):
         for now_s[0] in (600.0, 600.5, 10.0, 10.5, 11.1):
             link.spin_once()
     assert len(sent) == 3
-
-
-def test_the_packets_of_each_stream_are_numbered_one_by_one():
-    """An autopilot and a router count what is lost by these numbers."""
-    packer, message = Packer(1, 191, None, 0, 0), mavlink.MAVLink(None).ping_encode(0, 0, 1, 1)
-    numbers = [packer.pack(message, 10**18 + i, 0)[4] for i in range(600)]
-    assert numbers == [i % 256 for i in range(600)]

@@ -87,7 +87,11 @@ def test_a_message_that_we_do_not_know_is_no_bad_data():
     damaged = bytearray(mav.heartbeat_encode(2, 3, 0, 0, 4).pack(mav))
     damaged[-1] ^= 1
     assert parser.feed(bytes(damaged) + bytes(300)) == []
-    assert parser.bad_count > 0
+    noise = MavlinkParser()
+    for pieces in (1, 2, 3):
+        assert parser.bad_count > 0
+        assert noise.feed(b"noise") == []
+        assert noise.bad_count == pieces
 
 
 def test_another_autopilot_on_the_same_link_is_asked_for_its_own_messages():

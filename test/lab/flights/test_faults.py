@@ -58,9 +58,18 @@ def test_table_has_seventy_five_faults_with_distinct_names():
 def test_each_violated_requirement_is_reported():
     fault = fault_named("computer dies")
     result = fly_fault(fault, "ardupilot")
-    worse = result._replace(motion_s=0.6, excursion_m=9.0, resumed=True, evident=False, least_distance_m=2.0)
+    worse = result._replace(
+        motion_s=0.6, excursion_m=9.0, resumed=True, evident=False, least_distance_m=2.0, least_height_m=1.1
+    )
     report = " ".join(failures(fault, "ardupilot", worse))
-    for words in ("motion for 0.60 s", "excursion of 9.00 m", "without the operator", "no evidence", "2.00 m"):
+    for words in (
+        "motion for 0.60 s",
+        "excursion of 9.00 m",
+        "without the operator",
+        "no evidence",
+        "2.00 m",
+        "1.10 m",
+    ):
         assert words in report
     other = fault_named("perception stops")
     assert "the condition is not PICTURES_LOST" in failures(other, "px4", result)[0]

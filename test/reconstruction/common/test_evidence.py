@@ -14,6 +14,7 @@ from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.evidence import body_places, with_evidence
+from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import load_tracks, save_tracks
 from lab.studies.near_camera import NearCamera, known
@@ -64,6 +65,32 @@ def test_depths_have_the_scale_of_the_bones_and_an_error_measured_across_the_ima
     unknown, infinite = Evidence(np.full((40, 17, 3), np.nan), np.full((40, 17), np.nan)).depths(pose)
     assert np.isnan(unknown).all()
     assert np.isinf(infinite).all()
+
+
+@pytest.mark.parametrize(
+    ("stamps", "words"),
+    [
+        (lambda own: own, ""), (lambda own: own[2:6] + 10**6, ""), (lambda own: own + 10**12, "stamp_ns of the tracks"),
+        (lambda own: own[:-1], "stamp_ns of the tracks"), (None, "poses of 15 images, got 4"),
+    ],
+)  # fmt: skip
+def test_poses_belong_to_the_images_of_their_stamps(tmp_path, stamps, words) -> None:
+    tracks = simulate_capture(1.0, 15.0, seed=1).tracks
+    count = 4 if stamps is None else len(stamps(tracks.stamp_ns))
+    if words.startswith("stamp") and count < len(tracks):
+        count += 1
+    arrays = {"joints": NAMES["SMPL"].split(), "evidence": np.arange(count)[:, None, None] + np.zeros((count, 24, 3))}
+    if stamps is not None:
+        arrays["stamp_ns"] = stamps(tracks.stamp_ns)
+    np.savez(tmp_path / "e.npz", **arrays)
+    if words:
+        with pytest.raises(InputError, match=words):
+            with_evidence(tracks, tmp_path / "e.npz")
+        return
+    found = with_evidence(tracks, tmp_path / "e.npz").evidence[:, 0, 0]
+    known = np.flatnonzero(np.isfinite(found))
+    assert known.tolist() == (list(range(len(tracks))) if count == len(tracks) else [2, 3, 4, 5])
+    assert found[known].tolist() == list(range(count))
 
 
 @pytest.fixture(scope="module")
