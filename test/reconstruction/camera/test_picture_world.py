@@ -98,7 +98,7 @@ def test_camera_that_stands_still_gives_a_world_at_its_place() -> None:
 def test_feet_seen_from_high_above_stay_on_the_ground_that_is_seen() -> None:
     near = orbit(FRAMES, FPS)[1]
     position = 2.5 * near * [1.0, 1.0, 0.0] + [0.0, 0.0, 14.0]
-    rotation = looking(position, np.zeros((FRAMES, 3)) + [0.0, 0.0, 0.9])
+    rotation = looking(position, np.tile([0.0, 0.0, 0.9], (FRAMES, 1)))
     motion = reconstruct(tracks(rotation, position))
     assert motion.meta["camera"]["up"] == "ground"
     ankles = motion.joints3d[:, [motion.joints.index("rankle"), motion.joints.index("lankle")], 2].min(axis=1)
