@@ -78,7 +78,7 @@ def test_the_knees_of_outdoor_walk_bend_as_the_legs_shorten_in_the_image(outdoor
     assert np.corrcoef(flexion[:75], expected)[0, 1] > 0.75
     assert abs(np.median(flexion[:75]) - np.median(expected)) < 15
     # Then he turns to the side and walks on, upright.
-    assert np.median(flexion[100:140]) < 25
+    assert np.median(flexion[100:140]) < 30
 
 
 def test_squats_agree_with_another_system(shared, tmp_path, monkeypatch):

@@ -29,8 +29,8 @@ def test_demo_in_real_time_flies_and_shows_the_shares_of_the_processor(tmp_path,
 
 
 # The command, its processes of pictures, poses and adjustments, and multiprocessing's resource tracker.  In real time:
-# the command, seven nodes and the bridge's guardian, the server that forks the nodes, and the tracker.
-@pytest.mark.parametrize(("options", "processes"), [((), 5), (("--real-time",), 11)])
+# the command, seven nodes, the adjuster's process and the bridge's guardian, the server that forks, and the tracker.
+@pytest.mark.parametrize(("options", "processes"), [((), 5), (("--real-time",), 12)])
 def test_interrupted_demo_leaves_no_process_and_no_file(tmp_path, options, processes):
     command = [sys.executable, "-u", "-m", "drocap_ros.cli", "demo", "--out", str(tmp_path / "demo"), *options]
     mark = f"demo_{os.getpid()}"

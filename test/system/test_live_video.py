@@ -26,10 +26,11 @@ def test_published_messages_are_recorded_and_reconstructed(shared, tmp_path):
     config = config.replace("pose_estimator", models_dir=str(shared / "models"))
     config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
     config = config.replace("session_recorder", session_dir=str(tmp_path / "session"))
-    heard = []
+    heard, refined = [], []
     with bringup(config, NODES, processes=True) as graph:
         graph.node.create_subscription(TOPICS["pose2d"].message, "pose2d", heard.append, TOPICS["pose2d"].qos)
-        graph.wait_until(lambda: len(heard) > 80, 200, "keypoints")
+        graph.node.create_subscription(TOPICS["pose3d/refined"].message, "pose3d/refined", refined.append, 10)
+        graph.wait_until(lambda: len(heard) > 80 and refined, 200, "keypoints and an adjustment")
 
     # The standard readers decode every message, and every message received here is recorded.
     (path,) = (tmp_path / "session").glob("*.mcap")

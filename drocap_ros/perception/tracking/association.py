@@ -140,7 +140,9 @@ def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_
     sure = person.pose.last >= SURE_CONFIDENCE
     if person.hits < (min(2, confirm_frames) if sure else confirm_frames):
         return None
-    gone = [p for p in persons if p is not lost and p.plausible and p.undetected_s(stamp_ns) > _GONE_S]
+    # A box that came up once or twice, as a second one around the lost person, is nobody who comes back.
+    known = [p for p in persons if p is not lost and p.plausible and p.hits > confirm_frames]
+    gone = [p for p in known if p.undetected_s(stamp_ns) > _GONE_S]
     if any(look_cost(p, [person.appearance])[0] + MARGIN < look_cost(lost, [person.appearance])[0] for p in gone):
         return None
     # A second box around the same person is no other one.

@@ -38,8 +38,7 @@ _SCALE_STD = 0.3
 def picture_camera(camera: CameraPath, points: Background | None, size: tuple[int, int]) -> CameraPath | None:
     """The camera of images of ``size`` by their fixed points, in a unit and axes of its own.
 
-    None where there are none, or too few images.  An attitude that is known without a place tells up in these axes; a
-    camera whose attitude stays stands, where no points say what it does.
+    None where nothing tells it.  An attitude without a place tells up; where no points say more, one that stays stands.
     """
     if len(camera.stamp_ns) < LEAST_FRAMES:
         return None

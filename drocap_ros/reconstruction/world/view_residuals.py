@@ -26,6 +26,8 @@ OUTLIER_SQUARE = LiftedConfig.outlier_square
 #: The same over the median square, while all residuals are large: two standard deviations of the usual joint.
 _OVER_MEDIAN = 4.0
 _DEPTH_ROUNDING_M = DEPTH_ROUNDING_MM / 1000.0
+#: Weight of the lifter's depths, whose errors last, where further views measure them.
+_BESIDE_VIEWS = 0.2
 #: Least depth (m) of a joint before the camera: no drone is nearer.
 _NEAREST_M = 0.3
 #: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
@@ -47,8 +49,8 @@ class ViewWeights(NamedTuple):
     first: np.ndarray
 
 
-def view_weights(view: WorldInput) -> ViewWeights:
-    """Weights from the errors that are expected, and from the telemetry's roughness."""
+def view_weights(view: WorldInput, alone: bool) -> ViewWeights:
+    """Weights from the errors that are expected, and from the telemetry's roughness; ``alone``: no further view."""
     config, errors, fps = view.config, view.config.errors, view.fps
     rough = view.telemetry.roughness() / np.sqrt(2.0 / (errors.position_wander_s * fps))
     # What points leave of a receiver's noise is no error that wanders.
@@ -61,7 +63,7 @@ def view_weights(view: WorldInput) -> ViewWeights:
         first[:3] = fact / (fact / first[:3] + view.placed_m**2)
     return ViewWeights(
         acceleration=(errors.acceleration_m_s2 / fps**2) ** -2,
-        depth=1.0 / np.maximum(view.depth_sigma, 0.01),
+        depth=(1.0 if alone else _BESIDE_VIEWS) / np.maximum(view.depth_sigma, 0.01),
         wander=fact * wander,
         first=first,
     )

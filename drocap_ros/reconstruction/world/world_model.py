@@ -153,8 +153,7 @@ def config_of(camera: CameraPath, config: WorldConfig) -> WorldConfig:
 def _ground_m(camera: CameraPath) -> float:
     """Standard deviation (m) of a lower ankle from the ground's plane, for a camera so high above it.
 
-    From near the size of the body tells the height of his feet better than a plane that of uneven ground: he may stand
-    on a step.  From high above it errs by more than steps are high.
+    From near, the body's size tells the height of feet on a step; from high above it errs by more than steps are high.
     """
     if not camera.stands_on_points:
         return 0.0

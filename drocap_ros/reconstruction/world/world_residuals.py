@@ -88,7 +88,7 @@ def weights_of(data: WorldInput) -> WorldWeights:
         shared[CALIBRATED, CALIBRATED] += data.known.precision
         expected[CALIBRATED] = np.linalg.solve(shared[CALIBRATED, CALIBRATED], data.known.vector)
     return WorldWeights(
-        views=tuple(view_weights(view) for view in data.views),
+        views=tuple(view_weights(view, not data.further) for view in data.views),
         acceleration=(config.acceleration_m_s2 / data.fps**2) ** -2,
         shared=config.frames_per_fact * shared,
         expected=expected,
