@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,9 @@ def test_demo_in_real_time_flies_and_shows_the_shares_of_the_processor(tmp_path,
         assert "simulated time:" not in printed.out
 
 
-# The command, its processes of pictures, poses and adjustments, and multiprocessing's resource tracker.  In real time:
+# The command, and its processes of pictures, poses and adjustments.  In real time:
 # the command, seven nodes, the adjuster's process and the bridge's guardian, the server that forks, and the tracker.
-@pytest.mark.parametrize(("options", "processes"), [((), 5), (("--real-time",), 12)])
+@pytest.mark.parametrize(("options", "processes"), [((), 4), (("--real-time",), 12)])
 def test_interrupted_demo_leaves_no_process_and_no_file(tmp_path, options, processes):
     command = [sys.executable, "-u", "-m", "drocap_ros.cli", "demo", "--out", str(tmp_path / "demo"), *options]
     mark = f"demo_{os.getpid()}"
@@ -39,6 +40,9 @@ def test_interrupted_demo_leaves_no_process_and_no_file(tmp_path, options, proce
         for line in demo.stdout:
             if "pilot" in line:
                 break
+        end = time.monotonic() + 30  # of a busy machine, where a process of its own begins late
+        while len(_marked(mark)) < processes and time.monotonic() < end:
+            time.sleep(0.05)
         assert len(_marked(mark)) == processes
         demo.send_signal(signal.SIGINT)
         demo.stdout.read()
