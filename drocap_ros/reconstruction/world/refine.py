@@ -154,7 +154,8 @@ def refine_in_world(
     assert matrix is not None
     # The scale turns about the origin: near the camera's path, or the held person.
     origin = position.mean(axis=0) if before is None else _held_pelvis(before, int(stamp_ns[0]))
-    if config.ground_m and before is None:
+    config = config if before is None else replace(config, ground_m=0.0)  # the windows before know the floor
+    if config.ground_m:
         origin[2] = 0.0  # of the ground, whose height no scale changes
     capture = even_capture(camera, keypoints, poses, origin)
     windows = capture_windows(capture, config.feet)

@@ -277,8 +277,7 @@ def _near_ground(state: WorldState, ground_m: float) -> np.ndarray:
     near = np.zeros(height.shape)
     if not ground_m:
         return near
-    lower = height[:, : len(ANKLES)].argmin(axis=1)
-    rows = np.arange(len(near))
+    rows, lower = np.arange(len(near)), height[:, : len(ANKLES)].argmin(axis=1)
     near[rows, lower] = 1.0 / (ground_m * (1.0 + np.square(height[rows, lower] / _ABOVE_M))) ** 2
     return near
 
