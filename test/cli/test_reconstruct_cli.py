@@ -64,21 +64,31 @@ def test_outdoor_walk_gives_an_upright_motion_of_every_frame(outdoor_walk):
     assert motion.meta["stop_reason"]
 
 
+def knee(motion, side):
+    """Hip, knee and ankle, and the knee's flexion (F,) deg."""
+    leg = indices(motion.joints, (f"{side}hip", f"{side}knee", f"{side}ankle"))
+    bones = np.diff(motion.joints3d[:, leg], axis=1)
+    cosine = (bones[:, 0] * bones[:, 1]).sum(axis=1) / np.linalg.norm(bones, axis=2).prod(axis=1)
+    return leg, np.degrees(np.arccos(cosine))
+
+
+_BENT = pytest.mark.xfail(reason="28 degrees since still cameras are adjusted, 24 before", strict=True)
+
+
+@pytest.mark.parametrize("side", [pytest.param("r", marks=_BENT), "l"])
+def test_the_knees_of_outdoor_walk_are_nearly_straight_where_he_turns_to_the_side_and_walks(outdoor_walk, side):
+    assert np.median(knee(outdoor_walk, side)[1][100:140]) < 25
+
+
 @pytest.mark.parametrize("side", ["r", "l"])
 def test_the_knees_of_outdoor_walk_bend_as_the_legs_shorten_in_the_image(outdoor_walk, side):
-    leg = indices(outdoor_walk.joints, (f"{side}hip", f"{side}knee", f"{side}ankle"))
-    bones = np.diff(outdoor_walk.joints3d[:, leg], axis=1)
-    cosine = (bones[:, 0] * bones[:, 1]).sum(axis=1) / np.linalg.norm(bones, axis=2).prod(axis=1)
-    flexion = np.degrees(np.arccos(cosine))
+    leg, flexion = knee(outdoor_walk, side)
     # He does jumping jacks in the first 75 images, seen from the front: both bones of a leg lean alike.
     length = np.linalg.norm(np.diff(outdoor_walk.keypoints[:75, leg], axis=1), axis=2).sum(axis=1)
     expected = 2 * np.degrees(np.arccos(np.minimum(length / np.quantile(length, 0.95), 1)))
     print(f"{side} knee, jumping: {np.median(flexion[:75]):.0f} degrees, by the leg's length {np.median(expected):.0f}")
-    print(f"{side} knee, walking: {np.median(flexion[100:140]):.0f} degrees")
     assert np.corrcoef(flexion[:75], expected)[0, 1] > 0.75
     assert abs(np.median(flexion[:75]) - np.median(expected)) < 15
-    # Then he turns to the side and walks on, upright.
-    assert np.median(flexion[100:140]) < 30
 
 
 def test_squats_agree_with_another_system(shared, tmp_path, monkeypatch):

@@ -91,6 +91,15 @@ def test_half_hidden_subject_takes_its_own_detection_when_the_cover_goes_away():
     assert sorted(pairs) == [(0, 0), (1, 1)]
 
 
+def test_detection_near_the_subject_is_not_a_person_from_far_away():
+    # He somersaults; nobody has looked at her for 0.9 s.
+    subject, other = (Person(np.array(box), 0.8, 0, None) for box in ([848.0, 214, 1051, 361], [345.0, 516, 606, 945]))
+    for person in (subject, other):
+        person.filter.predict(867_000_000)
+    found = Seen(np.array([[898.0, 182, 1177, 481]]), np.array([0.54]), [None])
+    assert assign([subject, other], found) == [(0, 0)]
+
+
 def test_subject_that_fell_while_unseen_is_in_the_window_of_the_search():
     size, tracker = (1768, 994), SubjectTracker(PoseEstimatorConfig())
     search = SubjectSearch(None, tracker, PoseEstimatorConfig())

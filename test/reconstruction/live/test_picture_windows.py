@@ -67,7 +67,7 @@ def test_windows_are_in_a_world_of_the_picture_with_its_up_and_metres() -> None:
         assert abs(errors.scale) < 0.08
         std = np.sqrt(np.trace(unpack_covariance(w.covariance[:, 0]), axis1=1, axis2=2) / 3)
         assert (errors.wa_mm < 3000.0 * std).all()
-        assert (std < 0.7).all()
+        assert (std < 0.6).all()
     for before, after in itertools.pairwise(there):
         _, at, here = np.intersect1d(before.stamp_ns, after.stamp_ns, return_indices=True)
         step = np.linalg.norm(camera_of(before)[1][at] - camera_of(after)[1][here], axis=1)
