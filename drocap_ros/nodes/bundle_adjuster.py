@@ -37,7 +37,7 @@ from drocap_ros.ros.own_process import OwnProcess
 from drocap_ros.ros.topics import TFMessage
 from drocap_ros.skeleton import BODY_15, BODY_17
 
-_NICENESS = 19  # of the process that adjusts: it takes what the keypoints and the newest pose leave
+_NICENESS = 5  # of the process that adjusts: after keypoints and newest pose, never without a part of a busy machine
 _STARVED = 2.0  # an adjustment that takes so many times its limit has waited: its longest step takes a fifth of it
 #: Joint sets of initial poses.
 _SKELETONS = (BODY_15.name, BODY_17.name)
