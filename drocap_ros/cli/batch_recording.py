@@ -284,10 +284,16 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Generator[Record, Non
     except ImportError:
         install = f"{sys.executable} -m pip install 'drocap_ros[cluster]'"
         raise InputError(f"--cluster: expected dask.distributed, found none; run {install}") from None
-    try:
-        client = Client(address, timeout=_CONNECT_S)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError, TimeoutError) as error:
-        raise InputError(f"--cluster {address}: expected the address of a Dask scheduler; {error}") from None
+    for again in (True, True, False):
+        try:
+            client = Client(address, timeout=_CONNECT_S)  # type: ignore[no-untyped-call]
+            break
+        except (OSError, ValueError, TimeoutError) as error:
+            raise InputError(f"--cluster {address}: expected the address of a Dask scheduler; {error}") from None
+        except AssertionError:
+            # A busy scheduler sends further messages with its greeting, which the library does not expect.
+            if not again:
+                raise DrocapError(f"--cluster {address}: the scheduler is too busy; start the batch again") from None
     with client:
         threads = client.nthreads()  # type: ignore[no-untyped-call]
         print(f"{len(threads)} workers at {address}, dashboard {client.dashboard_link}", file=sys.stderr)
