@@ -31,6 +31,8 @@ _SHORT_FRAMES = 30  # frames: a second at the usual rate
 _MISSING_SHARE = 0.1
 #: Standard deviation of a bone's length over its mean; a judgement.
 _BONE_SPREAD = 0.1
+#: Distance of keypoints from a body that fits several recordings over that from their own: right pairs have up to 1.9.
+_MISFIT = 2.0
 #: Median reprojection error, share of the body's size in the image; a judgement.
 _HIGH_ERROR = 0.02
 #: Keypoints count as outlying from this share of the body's size on; a judgement.
@@ -68,6 +70,16 @@ class MotionCheck(Enum):
         "Possibly mirrored in depth",
         "{backward:.0%} of the {bent} bent knees bend backward. A body mirrored in depth fits the image equally well;"
         " compare with the video from the side, and check that left and right were not exchanged in 2D.",
+    )
+    MISFIT = (
+        "Recordings do not fit",
+        "Half of the keypoints of {name} lie more than {px:.1f} px from the body that fits all recordings, {alone:.1f}"
+        " from its own. They may show another person or another time; look at both from the same side.",
+    )
+    ONE_VIEW = (
+        "One view",
+        "The camera stands, and the view of the body turned by {span:.0f}° in all. Depth then rests mostly on ordinary"
+        " poses. A second recording from another side (--together) or a camera that moves round the body measures it.",
     )
     LOW_CAMERA_MOTION = (
         "Low camera motion",
@@ -155,12 +167,12 @@ class Finding:
 
 
 #: Checks that alone make a motion doubtful.
-_DOUBTFUL = (MotionCheck.MIRRORED, MotionCheck.HIGH_ERROR, MotionCheck.SLIDING_FEET)
+_DOUBTFUL = (MotionCheck.MIRRORED, MotionCheck.MISFIT, MotionCheck.HIGH_ERROR, MotionCheck.SLIDING_FEET)
 
 
 def run_checks(motion: Motion, s: Statistics) -> list[Finding]:
     """The findings of a motion, warnings first."""
-    found = [*_of_poses(motion, s), *_of_view(s), *_of_keypoints(motion, s), *_of_path(s), *_of_frame(motion)]
+    found = [*_of_poses(motion, s), *_of_view(motion, s), *_of_keypoints(motion, s), *_of_path(s), *_of_frame(motion)]
     order = list(MotionCheck)
     return sorted(found, key=lambda finding: (finding.severity is Severity.NOTE, order.index(finding.check)))
 
@@ -198,9 +210,17 @@ def _of_poses(motion: Motion, s: Statistics) -> Iterator[Finding]:
         yield _note(MotionCheck.BONE_LENGTHS, bone=s.bones[worst], worst=float(s.bone_spread[worst]), mean=mean)
 
 
-def _of_view(s: Statistics) -> Iterator[Finding]:
-    if not (s.view_speed_dps >= _SLOW_VIEW_DPS and s.view_span_deg >= _NARROW_VIEW_DEG):
-        yield _warn(MotionCheck.LOW_CAMERA_MOTION, span=s.view_span_deg, speed=s.view_speed_dps)
+def _of_view(motion: Motion, s: Statistics) -> Iterator[Finding]:
+    views = motion.meta.get("together", {}).get("views", ())
+    for view in views:
+        if view["misfit"] > _MISFIT:
+            values = {"px": view["median_px"], "alone": view["median_px_alone"]}
+            yield _warn(MotionCheck.MISFIT, name=view["name"], **values)
+    if not views and not (s.view_speed_dps >= _SLOW_VIEW_DPS and s.view_span_deg >= _NARROW_VIEW_DEG):
+        if motion.meta.get("camera", {}).get("kind") == "stands":
+            yield _warn(MotionCheck.ONE_VIEW, span=s.view_span_deg)
+        else:
+            yield _warn(MotionCheck.LOW_CAMERA_MOTION, span=s.view_span_deg, speed=s.view_speed_dps)
     if s.elevation_deg > _HIGH_VIEW_DEG:
         level = _warn if s.elevation_deg > _STEEP_VIEW_DEG else _note
         yield level(MotionCheck.STEEP_VIEW, elevation=s.elevation_deg, limit=_HIGH_VIEW_DEG)

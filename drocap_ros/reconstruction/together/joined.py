@@ -19,13 +19,15 @@ from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.reconstruct import Solved
 from drocap_ros.reconstruction.together.placement import Placement, follow_view, place_view
 from drocap_ros.reconstruction.together.problem import JoinedProblem
-from drocap_ros.reconstruction.together.timing import TimeOffset, time_offsets
+from drocap_ros.reconstruction.together.timing import LEAST_S, TimeOffset, time_offsets
 from drocap_ros.reconstruction.together.view import View
 from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.skeleton import BODY_17
 
-#: Least likeness of two motions of one person, as two views give them.
-_LEAST_LIKENESS = 0.3
+#: Least likeness of two motions of one person, as two views give them: right pairs have 0.9, others at most 0.8.
+_LEAST_LIKENESS = 0.45
+#: Distance of keypoints from the common body over that from their own (:func:`misfit`): right pairs have at most 1.9.
+_LARGEST_MISFIT = 2.5
 #: Distance (m) and turn (deg) between a person's places and views in two reported worlds that are the same one.
 _SAME_ORIGIN_M, _SAME_NORTH_DEG = 4.0, 10.0
 #: Of a view whose world is the first one's.
@@ -41,6 +43,7 @@ def join_views(solved: list[Solved], names: list[str]) -> list[Motion]:
         The common body as each recording's camera sees it, at the first one's images on its own clock, in the order of
         the recordings; the first one's motion has all of its frames.  ``meta["together"]`` has times and places.
     """
+    _refuse_copies(solved, names)
     views = [View.of(one, name) for one, name in zip(solved, names, strict=True)]
     home = _home(views)
     fits = [_best_fit(views[home], view, name, names[home]) for view, name in zip(views, names, strict=True)]
@@ -51,6 +54,13 @@ def join_views(solved: list[Solved], names: list[str]) -> list[Motion]:
     with blas_threads(solved[0].settings.adjuster.threads):
         refined = problem.with_home_errors(problem.solve())
         return _results(problem, refined, names)
+
+
+def _refuse_copies(solved: list[Solved], names: list[str]) -> None:
+    for n, (one, name) in enumerate(zip(solved, names, strict=True)):
+        for other, to in zip(solved[:n], names, strict=False):
+            if np.array_equal(one.keypoints.xy, other.keypoints.xy, equal_nan=True):
+                raise InputError(f"{name}: expected another view than that of {to}, found the same; name each once")
 
 
 def _best_fit(home: View, view: View, name: str, to: str) -> tuple[TimeOffset, Placement]:
@@ -64,8 +74,8 @@ def _best_fit(home: View, view: View, name: str, to: str) -> tuple[TimeOffset, P
     if not found or found[0].likeness < _LEAST_LIKENESS:
         alike = f"a likeness of {found[0].likeness:.2f}" if found else "too short a time"
         raise InputError(
-            f"{name}: expected the motion that {to} shows, for at least 2 s, found {alike} at the best time; are both"
-            " of the same person at the same time?"
+            f"{name}: expected the motion that {to} shows, for at least {LEAST_S:g} s, found {alike} at the best time;"
+            " are both of the same person at the same time?"
         )
     if home.reported and view.reported and (agreed := _agreed(home, view, found)):
         return agreed, _SAME_WORLD
@@ -103,7 +113,15 @@ def _results(problem: JoinedProblem, refined: RefinedWorld, names: list[str]) ->
     metric = problem.views[problem.home].reported and refined.metric
     scale = 1.0 if metric else problem.scale(refined)
     inputs = problem.inputs()
-    told = [{"name": name, **problem.told(n, inputs[n], refined)} for n, name in enumerate(names)]
+    found = [problem.told(n, inputs[n], refined) for n in range(len(names))]
+    worst = max(range(len(names)), key=lambda n: found[n]["misfit"])
+    if found[worst]["misfit"] > _LARGEST_MISFIT:
+        there, alone = found[worst]["median_px"], found[worst]["median_px_alone"]
+        raise InputError(
+            f"{names[worst]}: expected the motion that {names[problem.home]} shows, found keypoints {there:.0f} px from"
+            f" the body that fits all, {alone:.1f} from its own; are all of the same person at the same time?"
+        )
+    told = [{"name": name, **view} for name, view in zip(names, found, strict=True)]
     together = {"world_of": names[problem.home], "views": told}
     out = []
     for n, view in enumerate(problem.views):

@@ -12,12 +12,17 @@ from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.common.windows import even_slots
 from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
-from drocap_ros.reconstruction.together.view import Doubt, View
+from drocap_ros.reconstruction.together.view import View
 from drocap_ros.reconstruction.world.refine import Beside, RefinedWorld, refine_in_world
-from drocap_ros.reconstruction.world.world_model import WorldInput
+from drocap_ros.reconstruction.world.world_model import Doubt, WorldInput
 
-#: Errors of a place and an attitude that the bodies of single views give: their depths err by a tenth of the range,
-_PLACED_M, _PLACED_DEG = 0.5, 5.0
+#: Errors of a place and an attitude that the bodies of single views give: their depths err by a tenth of the range, and
+#: a body that is turned a little looks as one that faces the camera: two phones 38 degrees apart seemed to be 20.
+_PLACED_M, _PLACED_DEG = 0.5, 15.0
+#: Deviation (rad) of a turn that all bodies of a view's lifter have in common, as its errors last,
+_LEAN = 0.15
+#: and of the logarithm of bone lengths as single views give them: several views measure them.
+_LENGTH_STD = 0.02
 #: and the slow errors of a path beside those that its own recording knows of, before they are measured.
 _WANDER_M = 0.3
 #: Most of them that is believed: of a receiver without corrections; more is another motion.
@@ -28,7 +33,9 @@ _CHANGE_S, _CHANGE = 5.0, 0.4
 #: Least error (m) of a place that is believed: that of the best receivers.
 _LEAST_PLACED_M = 0.02
 #: Adjustments, each from the times and places that the one before has measured, and the change that ends them.
-_ROUNDS, _SAME_S = 5, 5e-4
+_ROUNDS, _SAME_S, _SAME_LENS = 5, 5e-4, 5e-3
+#: Usual error of a keypoint, share of the body's height in the image.
+_KEYPOINT_ERROR = 0.004
 #: Weight of the body as single views have it, in a start from the rays of all: deviation (m) of a joint.
 _SINGLE_M = 0.3
 
@@ -56,13 +63,15 @@ class JoinedProblem:
             start = self._start(inputs) if self._joints is None else self._joints
             refined = self._adjust(inputs, start)
             self._joints = refined.joints
+            self._find_lenses(refined)
+            inputs = self.inputs()
             late = [self._late(view, n, refined) for n, view in enumerate(inputs)]
             # The body goes with every view by its share: a view that is alone in being late seems less so.
             change = [(seconds - late[0][0]) * len(late) / (len(late) - 1) for seconds, _ in late]
             self.offsets = [offset + more for offset, more in zip(self.offsets, change, strict=True)]
             self.offset_std = [std for _, std in late]
             self._doubts = [self._doubt(n, inputs, refined) for n in range(len(inputs))]
-            if max(map(abs, change)) < _SAME_S:
+            if max(map(abs, change)) < _SAME_S and max(map(abs, refined.lens)) < _SAME_LENS:
                 break
         return refined
 
@@ -76,6 +85,15 @@ class JoinedProblem:
         rotation, position = self.camera(self.home, self.inputs()[self.home], refined)
         return with_camera_errors(refined, errors[np.minimum(near, len(errors) - 1)], rotation, position)
 
+    def _find_lenses(self, refined: RefinedWorld) -> None:
+        """The focal lengths that the adjustment has found are those of the views from now on."""
+        for n, more in enumerate(refined.lens):
+            camera, (mean, std) = self.views[n].camera, self._doubts[n].lens
+            assert camera.matrix is not None
+            matrix = camera.matrix @ np.diag([np.exp(more), np.exp(more), 1.0])
+            self.views[n] = replace(self.views[n], camera=replace(camera, matrix=matrix))
+            self._doubts[n] = self._doubts[n]._replace(lens=(mean - more, std))
+
     def inputs(self) -> list[WorldInput]:
         """Every view on the slots of the first one."""
         return [
@@ -84,10 +102,17 @@ class JoinedProblem:
         ]
 
     def _first_doubt(self, number: int) -> Doubt:
+        view = self.views[number]
+        doubt = Doubt(lens=(0.0, view.focal_std), lean_std=_LEAN)
         if number == self.home:
-            return Doubt(0.0, 0.0, 0.0)
-        view, upright = self.views[number], self.views[number].own_world and self.views[self.home].own_world
-        return Doubt(_PLACED_M, 0.0 if upright else _PLACED_DEG, 0.0 if view.stands else _WANDER_M)
+            return doubt
+        home, wander_m = self.views[self.home], 0.0 if view.stands else _WANDER_M
+        placed = doubt._replace(placed_m=_PLACED_M, wander_m=wander_m)
+        if view.reported and home.reported:
+            return placed
+        upright = view.own_world and home.own_world
+        tilt = max(view.solved.camera.up_std_deg, view.config.errors.tilt_deg) if upright else _PLACED_DEG
+        return placed._replace(placed_deg=(tilt, _PLACED_DEG))
 
     def _doubt(self, number: int, inputs: list[WorldInput], refined: RefinedWorld) -> Doubt:
         """The errors of a reported place as large as they are across the line to the other camera.
@@ -108,7 +133,7 @@ class JoinedProblem:
         rows = np.flatnonzero(later < len(time))
         placed = _across(off)
         wander = _across(off[later[rows]] - off[rows]) / _CHANGE if len(rows) else doubt.wander_m
-        return Doubt(max(placed, _LEAST_PLACED_M), doubt.placed_deg, min(wander, _MOST_WANDER_M))
+        return doubt._replace(placed_m=max(placed, _LEAST_PLACED_M), wander_m=min(wander, _MOST_WANDER_M))
 
     def _start(self, inputs: list[WorldInput]) -> np.ndarray:
         """(F, 17, 3) m nearest to the rays of all views, and to the bodies of each."""
@@ -136,10 +161,9 @@ class JoinedProblem:
         first = self.views[0]
         # Bones between joints that err are too long: those of the bodies that single views give.
         lengths = np.mean([np.median(span_lengths(view.joints), axis=0) for view in self.views], axis=0)
-        beside = Beside(tuple(inputs[1:]), inputs[0].placed_m, inputs[0].placed_deg, lengths)
-        found = refine_in_world(
-            first.camera, first.solved.keypoints, first.placed_poses(start), inputs[0].config, beside=beside
-        )
+        beside = Beside(tuple(inputs[1:]), inputs[0].doubt, lengths)
+        config = replace(inputs[0].config, length_std=_LENGTH_STD)
+        found = refine_in_world(first.camera, first.solved.keypoints, first.placed_poses(start), config, beside=beside)
         assert not isinstance(found, Refusal)
         return found
 
@@ -177,18 +201,22 @@ class JoinedProblem:
     def told(self, number: int, view: WorldInput, refined: RefinedWorld) -> dict[str, float | bool]:
         """JSON-compatible: time and place of a view, and how far its keypoints lie from the common body.
 
+        misfit : that distance over the one from its own body, or over usual errors of keypoints
         by_body : whether the camera moves and nothing but the body in its pictures tells how
         """
         keypoints, _ = self.shown(number, view)
         off = reprojection_px(refined.joints, *self.camera(number, view, refined), view.camera_matrix, keypoints)
         alone = self.views[number].solved.motion.reprojection_px[:, :17]
-        doubt = self._doubts[number]
+        doubt, height = self._doubts[number], keypoints[np.isfinite(keypoints).any(axis=(1, 2)), :, 1]
+        size = float(np.median(np.nanmax(height, axis=1) - np.nanmin(height, axis=1)))
         return {
             "offset_s": self.offsets[number],
             "offset_std_s": float(np.hypot(self.offset_std[number], self.offset_std[0])) if number else 0.0,
             "median_px": float(np.nanmedian(off)),
             "median_px_alone": float(np.nanmedian(alone)),
+            "misfit": float(np.nanmedian(off)) / max(float(np.nanmedian(alone)), _KEYPOINT_ERROR * size),
             "placed_m": doubt.placed_m,
+            "focal_px": 0.5 * float(view.camera_matrix[0, 0] + view.camera_matrix[1, 1]),
             "by_body": not (self.views[number].own_world or self.views[number].stands),
         }
 

@@ -16,7 +16,7 @@ _SLOW_S = 1.0
 #: Standard deviation (s) of the average that takes noise out.
 _FAST_S = 0.03
 #: Shortest time (s) in which two recordings show the person together.
-LEAST_S = 2.0
+LEAST_S = 1.5
 #: Joints whose heights above the pelvis and whose distances from each other are compared.
 _MOVING = ("head", "rwrist", "lwrist", "relbow", "lelbow", "rknee", "lknee", "rankle", "lankle")
 #: Longest time (s) without the person that is bridged.

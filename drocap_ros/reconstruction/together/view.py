@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.geometry.rotations import project_to_so3
 from drocap_ros.motion import LEVEL_CAMERA
+from drocap_ros.reconstruction.camera.from_picture import FOCAL_STD
 from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.reconstruct import Solved
 from drocap_ros.reconstruction.together.timing import ShownMotion
@@ -19,7 +19,14 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.even_capture import keypoint_weights
 from drocap_ros.reconstruction.world.in_world import in_camera_axes
 from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
-from drocap_ros.reconstruction.world.world_model import PlacedPoses, WorldConfig, WorldInput, config_of, world_config
+from drocap_ros.reconstruction.world.world_model import (
+    Doubt,
+    PlacedPoses,
+    WorldConfig,
+    WorldInput,
+    config_of,
+    world_config,
+)
 
 #: Longest time (s) between two images between which a joint is interpolated.
 _GAP_S = 0.1
@@ -33,17 +40,6 @@ _STANDING = WorldConfig(
 _FOLLOWED = WorldConfig(
     errors=CameraErrors(latency_s=1e-3, position_wander_m=0.5, attitude_wander_deg=8.0), checks=False
 )
-
-
-class Doubt(NamedTuple):
-    """Standard deviations of a camera's placement in the common world, and of its path's slow errors beyond its own.
-
-    placed_deg : 0 = a camera that knows up errs as it does alone
-    """
-
-    placed_m: float
-    placed_deg: float
-    wander_m: float
 
 
 @dataclass(frozen=True)
@@ -91,6 +87,14 @@ class View:
     def reported(self) -> bool:
         """Whether the world is that of telemetry: east, north and up."""
         return self.own_world and self.camera.of_reports
+
+    @property
+    def focal_std(self) -> float:
+        """Of the logarithm of the focal length."""
+        camera = self.solved.camera
+        if camera.lens == "given":
+            return 0.0
+        return FOCAL_STD if camera.picture is None else camera.picture.focal_std
 
     @property
     def errors(self) -> np.ndarray | None:
@@ -174,8 +178,7 @@ class View:
             config=replace(self.config, errors=replace(self.config.errors, position_wander_m=wander_m)),
             seen=seen,
             still=None if still is None else np.where(step.inside[:, None], step.of(still), 0.5),
-            placed_m=doubt.placed_m,
-            placed_deg=doubt.placed_deg,
+            doubt=doubt,
         )
 
     def _depth(self) -> tuple[np.ndarray, np.ndarray]:

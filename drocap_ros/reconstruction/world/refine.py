@@ -42,6 +42,7 @@ from drocap_ros.reconstruction.world.world_model import (
     MISALIGNMENT,
     POSITION_LATENCY,
     SCALE,
+    Doubt,
     Findings,
     PlacedPoses,
     WorldConfig,
@@ -62,13 +63,12 @@ _CONTACTS_FPS = 8.0
 class Beside(NamedTuple):
     """Other cameras' views of the same body at all slots of the even grid, in the same world.
 
-    placed_m, placed_deg : of the first view's own camera, as in :class:`WorldInput`
+    doubt : of the first view
     lengths : (18,) m of the body, of the spans; None = those of the poses to start from
     """
 
     views: tuple[WorldInput, ...] = ()
-    placed_m: float = 0.0
-    placed_deg: float = 0.0
+    doubt: Doubt = Doubt()
     lengths: np.ndarray | None = None
 
     def window(self, rows: slice, lengths: np.ndarray, origin: np.ndarray) -> tuple[WorldInput, ...]:
@@ -102,6 +102,7 @@ class RefinedWorld:
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
     found : of the last window; before : that window, for the next one
     further : (V, F, 6) of V further views, corrections of the camera's position (m) and rotation (rad, camera axes)
+    lens : (1 + V,) of every view, logarithm of the focal length over that of its matrix, mean of the windows
     """
 
     joints: np.ndarray
@@ -114,6 +115,7 @@ class RefinedWorld:
     found: Findings
     before: Before
     further: np.ndarray
+    lens: np.ndarray
 
 
 class Before(NamedTuple):
@@ -194,6 +196,7 @@ def refine_in_world(
         found=last.findings,
         before=Before(stamp_ns, joints, wander, last.state.globals[:GLOBALS]),
         further=np.array(further).reshape(-1, len(joints), CAMERA),
+        lens=np.mean(facts.lens, axis=0),
     )
 
 
@@ -248,8 +251,7 @@ def _adjusted(
             known=prior,
             still=None if capture.still is None else capture.still[rows],
             further=scene.beside.window(rows, lengths, capture.origin),
-            placed_m=scene.beside.placed_m,
-            placed_deg=scene.beside.placed_deg,
+            doubt=scene.beside.doubt,
         )
         state = WorldState(joints[rows], wander[rows], scene.start.shared)
         found = adjust_in_world(data, state, scene.held if rows.start == 0 else 0)
@@ -262,12 +264,14 @@ class _Facts:
 
     def __init__(self) -> None:
         self.calibration: list[dict[str, object]] = []
+        self.lens: list[list[float]] = []
         self.metric = True
         self._cost, self._contact = 0.0, 1.0
 
     def add(self, window: CaptureWindow, found: WorldSolution, telemetry: CameraTelemetry, stature_std: float) -> None:
         contact = float(found.contact[:, : len(ANKLES)].mean())
         self.calibration.append(_calibration(found, contact, stature_std, telemetry))
+        self.lens.append(found.state.lens.tolist())
         self.metric &= bool(found.std[SCALE] < MEASURED * found.state.globals[SCALE])
         self._cost = max(self._cost, found.cost_terms["telemetry"] / len(found.joints))
         if window.tells and telemetry.fps >= _CONTACTS_FPS:

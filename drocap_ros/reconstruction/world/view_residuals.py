@@ -14,6 +14,8 @@ from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.world.world_model import (
     ATTITUDE_LATENCY,
     CAMERA,
+    LEAN,
+    LENS,
     MISALIGNMENT,
     POSITION_LATENCY,
     SCALE,
@@ -27,14 +29,16 @@ OUTLIER_SQUARE = LiftedConfig.outlier_square
 _OVER_MEDIAN = 4.0
 _DEPTH_ROUNDING_M = DEPTH_ROUNDING_MM / 1000.0
 #: Weight of the lifter's depths, whose errors last, where further views measure them.
-_BESIDE_VIEWS = 0.2
+_BESIDE_VIEWS = 0.1
 #: Least depth (m) of a joint before the camera: no drone is nearer.
 _NEAREST_M = 0.3
 #: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
 _OWN_LATENCY = 0.2
 #: The shared unknowns of a camera, and their columns in its derivatives: a misalignment turns every frame.
-OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY]
-CAMERA_COLUMNS = np.array([6, 3, 4, 5, 7, 8])
+OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY, LENS, LEAN]
+CAMERA_COLUMNS = np.array([6, 3, 4, 5, 7, 8, 9, 10, 11])
+#: Deviation of the logarithm of a focal length that is known, and of a lean (rad) that is none.
+_KNOWN = 1e-6
 
 
 class ViewWeights(NamedTuple):
@@ -59,8 +63,8 @@ def view_weights(view: WorldInput, alone: bool) -> ViewWeights:
     first = np.repeat([position**-2, attitude**-2], 3)
     wander, fact = first * (0.5 * errors.wander_s * fps), config.frames_per_fact
     first = fact * first
-    if view.placed_m:  # a camera that was placed by the body errs by its placement
-        first[:3] = fact / (fact / first[:3] + view.placed_m**2)
+    if view.doubt.placed_m:  # a camera that was placed by the body errs by its placement
+        first[:3] = fact / (fact / first[:3] + view.doubt.placed_m**2)
     return ViewWeights(
         acceleration=(errors.acceleration_m_s2 / fps**2) ** -2,
         depth=(1.0 if alone else _BESIDE_VIEWS) / np.maximum(view.depth_sigma, 0.01),
@@ -70,15 +74,15 @@ def view_weights(view: WorldInput, alone: bool) -> ViewWeights:
 
 
 def errors_precision(view: WorldInput) -> np.ndarray:
-    """(5, 5) inverse covariance of misalignment (rad, camera axes) and latencies (s)."""
-    errors, axes = view.config.errors, view.telemetry.gimbal_axes()
-    turned = np.deg2rad([errors.tilt_deg, errors.yaw_deg, errors.tilt_deg])
-    precision = np.zeros((5, 5))
+    """(8, 8) inverse covariance of misalignment (rad, camera axes), latencies (s), the lens' logarithm and lean."""
+    errors, doubt, axes = view.config.errors, view.doubt, view.telemetry.gimbal_axes()
+    tilt, yaw = doubt.placed_deg or (errors.tilt_deg, errors.yaw_deg)
+    turned = np.deg2rad([tilt, yaw, tilt])
+    precision = np.zeros((8, 8))
     precision[:3, :3] = axes.T @ np.diag(turned**-2) @ axes
-    if view.placed_m and view.placed_deg:
-        precision[:3, :3] = np.eye(3) / np.deg2rad(view.placed_deg) ** 2
     own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
-    precision[3:, 3:] = np.linalg.inv(errors.latency_s**2 * own)
+    precision[3:5, 3:5] = np.linalg.inv(errors.latency_s**2 * own)
+    precision[5:, 5:] = np.diag(np.maximum([doubt.lens[1], doubt.lean_std, doubt.lean_std], _KNOWN) ** -2)
     return precision
 
 
@@ -114,18 +118,21 @@ class ViewResiduals:
         offset = self.state.joints - shared[SCALE] * self.position[:, None]
         self.seen = offset @ np.swapaxes(self.rotation, 1, 2)
         # Along the reported view, a lifter whose bodies lean would turn the camera.
-        self.view = self.rotation[:, 2]
+        self.lean = shared[LEAN]
+        self.view = self.rotation[:, 2] - self.lean @ self.rotation[:, :2]
 
     def _compare_image(self) -> None:
         """Projected joints with the keypoints, and depths behind the pelvis with the lifter's."""
         data = self.data
         self.depth = np.maximum(self.seen[..., 2], _NEAREST_M)
-        focal, centre = np.diagonal(data.camera_matrix)[:2], data.camera_matrix[:2, 2]
-        pixels = focal * self.seen[..., :2] / self.depth[..., None] + centre
+        self.focal = np.diagonal(data.camera_matrix)[:2] * np.exp(self.state.globals[LENS])
+        self.from_centre = self.focal * self.seen[..., :2] / self.depth[..., None]
+        pixels = self.from_centre + data.camera_matrix[:2, 2]
         self.image = np.where(data.weight[..., None] > 0, pixels - data.keypoints, 0.0)
         self.square = np.square(self.image).sum(-1) * data.weight
         self.robust = 1.0 / (1.0 + self.square / self._outlier)
-        self.relief = self.seen[..., 2] - self.seen[:, :1, 2] - data.depth
+        about = self.seen - self.seen[:, :1]
+        self.relief = about[..., 2] - about[..., :2] @ self.lean - data.depth
         self.rounded = np.sqrt(np.square(self.relief) + _DEPTH_ROUNDING_M**2)
 
     def _compare_camera(self) -> None:
@@ -143,15 +150,15 @@ class ViewResiduals:
     def image_derivatives(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The image residuals (F, 34) at the present robust weight, and their derivatives.
 
-        By the joint (F, 34, 3), and by the camera (F, 34, 9): position, rotation, scale, latencies; rows are u and v of
-        every joint.
+        By the joint (F, 34, 3), and by the camera (F, 34, 12): position, rotation, scale, latencies, lens, lean;
+        rows are u and v of every joint.
         """
         frames, scale = len(self.seen), self.state.globals[SCALE]
         root = np.sqrt(self.data.weight) * self.robust
         x, y, z = np.moveaxis(self.seen, -1, 0)
         far = z > _NEAREST_M
         slope = np.where(far[..., None], self.seen[..., :2] / self.depth[..., None], 0.0)
-        per_m = root[..., None] * np.diagonal(self.data.camera_matrix)[:2] / self.depth[..., None]
+        per_m = root[..., None] * self.focal / self.depth[..., None]
         by_joint = per_m[..., None] * (self.rotation[:, None, :2] - slope[..., None] * self.rotation[:, None, 2:])
         # Rows of the joints' change by a rotation, less the slope times that of the depth.
         by_turn = np.empty(by_joint.shape)
@@ -160,22 +167,25 @@ class ViewResiduals:
         by_turn[:, :, 0, 2], by_turn[:, :, 1, 2] = -y, x
         by_turn *= per_m[..., None]
         by_joint, by_turn = by_joint.reshape(frames, -1, 3), by_turn.reshape(frames, -1, 3)
-        camera = np.empty((*by_joint.shape[:2], 9))
+        camera = np.zeros((*by_joint.shape[:2], 12))
         camera[..., :3] = -scale * by_joint
         camera[..., 3:6] = by_turn @ left_jacobian(self.turn)
         camera[..., 6:7] = by_joint @ -self.position[..., None]
         camera[..., 7:8] = by_turn @ self.turn_rate[..., None]
         camera[..., 8:9] = by_joint @ (-scale * self.velocity[..., None])
+        camera[..., 9] = (root[..., None] * self.from_centre).reshape(frames, -1)
         return (root[..., None] * self.image).reshape(frames, -1), by_joint, camera
 
     @cached_property
     def depth_derivatives(self) -> np.ndarray:
-        """Derivatives (F, 17, 9) of the depths behind the pelvis by the camera, as in :meth:`image_derivatives`."""
-        x, y, _ = np.moveaxis(self.seen - self.seen[:, :1], -1, 0)
-        by_turn = np.stack([y, -x, np.zeros(x.shape)], axis=-1)
-        out = np.zeros((*x.shape, 9))
+        """Derivatives (F, 17, 12) of the depths behind the pelvis by the camera, as in :meth:`image_derivatives`."""
+        x, y, z = np.moveaxis(self.seen - self.seen[:, :1], -1, 0)
+        a, b = self.lean
+        by_turn = np.stack([y + b * z, -x - a * z, a * y - b * x], axis=-1)
+        out = np.zeros((*x.shape, 12))
         out[..., 3:6] = by_turn @ left_jacobian(self.turn)
         out[..., 7:8] = by_turn @ self.turn_rate[..., None]
+        out[..., 10], out[..., 11] = -x, -y
         return out
 
     def add_gradient(self, camera: np.ndarray, joints: np.ndarray, shared: np.ndarray) -> None:

@@ -79,12 +79,14 @@ SCALE = FLOOR + 1
 MISALIGNMENT = slice(SCALE + 1, SCALE + 4)
 ATTITUDE_LATENCY = MISALIGNMENT.stop
 POSITION_LATENCY = ATTITUDE_LATENCY + 1
-GLOBALS = POSITION_LATENCY + 1
+LENS = POSITION_LATENCY + 1
+LEAN = slice(LENS + 1, LENS + 3)
+GLOBALS = LEAN.stop
 #: Those of every camera; each further view of the same body has its own ones, behind ``GLOBALS``.
 OF_VIEW = slice(MISALIGNMENT.start, GLOBALS)
 OWN = OF_VIEW.stop - OF_VIEW.start
 #: The unknowns of a :class:`~drocap_ros.reconstruction.world.world_model.Findings`.
-CALIBRATED = slice(SCALE, GLOBALS)
+CALIBRATED = slice(SCALE, LENS)
 
 
 def joint_columns(views: int) -> slice:
@@ -180,6 +182,22 @@ class PlacedPoses:
     still: np.ndarray | None = None
 
 
+class Doubt(NamedTuple):
+    """Standard deviations of what only further views of a body can tell; zeros and None: a view alone.
+
+    placed_m, placed_deg : of the place, and of tilt and yaw, of a camera that was placed in this world by the body
+    wander_m : of its path's slow errors beyond its own
+    lens : logarithm of the focal length over that of the matrix, and its deviation
+    lean_std : rad, of a turn of all bodies that the lifter sees, whose errors last
+    """
+
+    placed_m: float = 0.0
+    placed_deg: tuple[float, float] | None = None
+    wander_m: float = 0.0
+    lens: tuple[float, float] = (0.0, 0.0)
+    lean_std: float = 0.0
+
+
 @dataclass(frozen=True)
 class WorldInput:
     """What is measured and assumed, of evenly spaced frames.
@@ -192,8 +210,6 @@ class WorldInput:
     known : findings of earlier windows
     still : (F, 2) the network's probability that the right and the left foot rest, None = unknown
     further : other cameras' views of the same body at the same instants
-    placed_m, placed_deg : standard deviations of the place and attitude of a camera that was placed in this world by
-        the body; 0 = the world is the camera's own
     """
 
     keypoints: np.ndarray
@@ -208,8 +224,7 @@ class WorldInput:
     known: Findings | None = None
     still: np.ndarray | None = None
     further: tuple[WorldInput, ...] = ()
-    placed_m: float = 0.0
-    placed_deg: float = 0.0
+    doubt: Doubt = field(default_factory=Doubt)
 
     @property
     def fps(self) -> float:
@@ -228,8 +243,9 @@ class WorldState:
 
     joints : (F, 17, 3) m of the body, world axes
     camera : (F, 6 V) of V views, each: error of the reported position (m) and rotation (rad, camera axes) that wanders
-    globals : (GLOBALS,) lengths, floor (m of the body), scale, misalignment (rad), latencies (s); then ``OF_VIEW`` of
-        each further view
+    globals : (GLOBALS,) lengths, floor (m of the body), scale, misalignment (rad), latencies (s), logarithm of the
+        focal length over that of the matrix, lean of the lifter's bodies (rad, about the image's axes); then
+        ``OF_VIEW`` of each further view
     """
 
     joints: np.ndarray
@@ -244,6 +260,11 @@ class WorldState:
         """The point as one view has it."""
         own = shared_columns(number)
         return WorldState(self.joints, self.camera[:, CAMERA * number : CAMERA * (number + 1)], self.globals[own])
+
+    @property
+    def lens(self) -> np.ndarray:
+        """(V,) of every view."""
+        return self.globals[LENS::OWN]
 
     def with_views(self, further: int) -> WorldState:
         """A point of one view with as many further ones, whose cameras stand where they were placed."""

@@ -43,6 +43,7 @@ from drocap_ros.reconstruction.world.world_model import (
     GLOBALS,
     JOINTS,
     LENGTHS,
+    LENS,
     OF_VIEW,
     OWN,
     SCALE,
@@ -84,6 +85,7 @@ def weights_of(data: WorldInput) -> WorldWeights:
     for number, view in enumerate(data.views):
         own = shared_columns(number)[OF_VIEW]
         shared[np.ix_(own, own)] = errors_precision(view)
+        expected[own[LENS - OF_VIEW.start]] = view.doubt.lens[0]
     if data.known is not None:
         shared[CALIBRATED, CALIBRATED] += data.known.precision
         expected[CALIBRATED] = np.linalg.solve(shared[CALIBRATED, CALIBRATED], data.known.vector)
@@ -262,12 +264,12 @@ def _add_view(
         blocks[:, here, here] += joint[:, j]
         if j:
             blocks[:, body : body + 3, here] -= depth[:, j - 1]
-    both = camera.reshape(frames, JOINTS, 2, 9)
+    both = camera.reshape(frames, JOINTS, 2, -1)
     coupling = rows[:, :, 0, :, None] * both[:, :, 0, None, :] + rows[:, :, 1, :, None] * both[:, :, 1, None, :]
     by_depth = r.view[:, None, :, None] * (along * turned)[:, :, None]
     coupling += by_depth
     coupling[:, 0] -= by_depth.sum(axis=1)
-    coupling = coupling.reshape(frames, _BODY, 9)
+    coupling = coupling.reshape(frames, _BODY, -1)
     blocks[:, at, body:] = np.swapaxes(coupling[..., :CAMERA], 1, 2)
     border[:, body:, own] += coupling[..., CAMERA_COLUMNS]
 

@@ -10,7 +10,15 @@ from test_world_adjustment import FPS, exact_input, orbit, walker
 
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world
-from drocap_ros.reconstruction.world.world_model import CAMERA, GLOBALS, LENGTHS, SCALE, WorldInput, WorldState
+from drocap_ros.reconstruction.world.world_model import (
+    CAMERA,
+    GLOBALS,
+    LENGTHS,
+    SCALE,
+    Doubt,
+    WorldInput,
+    WorldState,
+)
 from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, weights_of
 
 
@@ -21,7 +29,7 @@ def two_views(joints: np.ndarray) -> WorldInput:
     for bearing in (0.0, 2.0):
         rotation, position = orbit(bearing + 0.01 * np.arange(frames), np.zeros((frames, 2)))
         views.append(exact_input(joints, rotation, position, CameraTelemetry(rotation, position, FPS)))
-    return replace(views[0], further=(replace(views[1], placed_m=0.5, placed_deg=5.0),))
+    return replace(views[0], further=(replace(views[1], doubt=Doubt(0.5, (5.0, 5.0), lens=(0.0, 0.2), lean_std=0.1)),))
 
 
 def test_derivatives_of_all_views_are_those_of_the_cost() -> None:
