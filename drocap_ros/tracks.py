@@ -29,6 +29,10 @@ _FARTHEST_PX = 1e9
 _NORMALISED = 2.0
 #: Share of the picture's size beyond its edge at which networks still place joints of a person who is cut off.
 _OUTSIDE = 0.1
+#: Share of keypoints outside the picture from which they are none of it, as 3D poses about the hips.
+_MOST_OUTSIDE = 0.4
+#: Scores a little above 1 are usual; COCO's flags end at 2.
+_HIGHEST_SCORE = 2.0
 #: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
 _FOCAL_SHARES = (0.1, 100.0)
 
@@ -275,6 +279,7 @@ def load_tracks(path: str | Path) -> Tracks:
         more = {name: _as_float(arrays[name], name) for name in _OPTIONAL if name in arrays}
         xy = _as_float(arrays["keypoints"], "keypoints")
         if xy.ndim == 3 and xy.shape[2] == 3:  # x, y, score
+            _check_scores(xy[..., 2])
             more.setdefault("confidence", np.clip(np.nan_to_num(xy[..., 2]), 0.0, 1.0))
             xy = xy[..., :2]
         return Tracks(
@@ -290,11 +295,27 @@ def load_tracks(path: str | Path) -> Tracks:
         raise InputError(f"{path}: {error}") from None
 
 
+def _check_scores(scores: np.ndarray) -> None:
+    low, high = np.nanmin(scores, initial=0.0), np.nanmax(scores, initial=0.0)
+    if low < 0 or high > _HIGHEST_SCORE:
+        raise InputError(
+            f"keypoints: expected x, y px and a score from 0 to 1, found {low:g} to {high:g} in the third column, as of"
+            " 3D poses; give the 2D keypoints of the pictures"
+        )
+
+
 def without_unseen(path: Path, xy: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Keypoints (F, P, 2) with NaN for zeros, pairs below zero and places far outside, as other tools mark them."""
     unseen = np.asarray((xy <= 0).all(axis=2)) | ((xy < -_OUTSIDE * size) | (xy > (1 + _OUTSIDE) * size)).any(axis=2)
     if not unseen.any() or unseen.all():
         return xy
+    placed = np.isfinite(xy).all(axis=2) & (xy != 0).any(axis=2) & (xy != -1).any(axis=2)
+    share = (unseen & placed).sum() / max(placed.sum(), 1)
+    if share > _MOST_OUTSIDE:
+        raise InputError(
+            f"keypoints: expected px of an image of {size[0]}x{size[1]}, found {share:.0%} of them outside; convert"
+            " them, from its upper left corner"
+        )
     logging.getLogger(__name__).warning("%s: %d keypoints at (0, 0) or outside are not seen", path, unseen.sum())
     return np.where(unseen[..., None], np.nan, xy)
 

@@ -11,6 +11,7 @@ import numpy as np
 from drocap_ros.contacts import MOTION_REST_M_S
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
+from drocap_ros.recording.keypoints.body_check import is_no_body
 from drocap_ros.report.statistics import Statistics, mean_known
 from drocap_ros.skeleton import TOES
 
@@ -89,6 +90,11 @@ class MotionCheck(Enum):
         "Half of the joints project more than {px:.1f} px from their keypoints, {share:.1%} of the body's size in the"
         " image. The 2D keypoints are noisy, or the motion does not explain them.",
     )
+    NO_BODY = (
+        "Keypoints of no body",
+        "By their places in the image the keypoints are not those of a person with these names: joints are exchanged,"
+        " of another order, or upside down. Check the names; `drocap reconstruct --order NAME` replaces them.",
+    )
     OUTLIERS = (
         "Outlying keypoints",
         "{share:.1%} of the keypoints lie more than {limit:.0%} of the body's size from the projected joints. They"
@@ -155,7 +161,7 @@ class Finding:
 
 
 #: Checks that alone make a motion doubtful.
-_DOUBTFUL = (MotionCheck.MIRRORED, MotionCheck.HIGH_ERROR, MotionCheck.SLIDING_FEET)
+_DOUBTFUL = (MotionCheck.NO_BODY, MotionCheck.MIRRORED, MotionCheck.HIGH_ERROR, MotionCheck.SLIDING_FEET)
 
 
 def run_checks(motion: Motion, s: Statistics) -> list[Finding]:
@@ -210,6 +216,8 @@ def _of_view(s: Statistics) -> Iterator[Finding]:
 
 
 def _of_keypoints(motion: Motion, s: Statistics) -> Iterator[Finding]:
+    if is_no_body(motion.keypoints, motion.joints):
+        yield _warn(MotionCheck.NO_BODY)
     # The median: a few gross outliers in 2D, which the method ignores, are no reason to doubt the rest.
     if (share := s.median_px / s.body_px) > _HIGH_ERROR:
         yield _warn(MotionCheck.HIGH_ERROR, px=s.median_px, share=share)
