@@ -25,7 +25,8 @@ _VIDEOS = (".mp4", ".mov", ".lrf")
 #: Codes of the registry of ISO/IEC 14496-12 in words.
 _FORMATS = {
     "avc1": "H.264", "hvc1": "H.265", "hev1": "H.265", "vp09": "VP9", "av01": "AV1", "mp4v": "MPEG-4", "jpeg": "JPEG",
-    "mp4a": "AAC", "djmd": "DJI telemetry", "dbgi": "DJI debugging data", "mebx": "metadata", "tmcd": "time code",
+    "mp4a": "AAC", "djmd": "DJI telemetry", "gpmd": "GoPro telemetry",
+    "dbgi": "DJI debugging data", "mebx": "metadata", "tmcd": "time code",
 }  # fmt: skip
 
 
@@ -113,7 +114,7 @@ def _log_facts(log: TelemetryLog) -> list[tuple[str, str]]:
         facts.append(("on video", parts))
     if log.lens is not None:
         facts.append(("lens", str(log.lens)))
-    return facts + [("missing", str(lack)) for lack in log.lacks]
+    return facts + [("note", str(lack)) for lack in log.lacks]
 
 
 def _rows(log: TelemetryLog) -> list[tuple[str, ...]]:

@@ -86,8 +86,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--telemetry",
         metavar="LOG",
         type=Path,
-        help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt, Airdata .csv (default: the DJI"
-        " track inside the video, else the .SRT of its name); none: no telemetry, nor that of a session or tracks file",
+        help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt, Airdata .csv, .gpx (default: the"
+        " DJI track inside the video, else the .SRT of its name); LOG#NAME chooses one of several vehicles or mounts;"
+        " none: no telemetry, nor that of a session or tracks file",
     )
     parser.add_argument(
         "--time-offset",

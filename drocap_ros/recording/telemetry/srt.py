@@ -3,7 +3,7 @@
 Supported forms: bracketed ``[latitude: 47.3] [rel_alt: 10.0 abs_alt: 450.1] [gb_yaw: 12.3 gb_pitch: -20.0
 gb_roll: 0.0]``, the gimbal also as ``gimbal_yaw``, the aircraft as ``drone_yaw`` or ``flight_yaw``; ``F_PRY (..°, ..°,
 ..°), G.PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older ``GPS(lon,lat,n) BAROMETER:20.5``, of some models
-``GPS(lat,lon,0.0M)`` or ``GPS(E:lon, N:lat, 5.0m)``.
+``GPS(lat,lon,0.0M)`` or ``GPS(E:lon, N:lat, 5.0m)``, with RTK ``RTK (lon, lat, n)``.
 """
 
 from __future__ import annotations
@@ -43,8 +43,13 @@ _VALUE = re.compile(rf"\b(latitude|longitude|longtitude|rel_alt|abs_alt|altitude
 #: Angles by name: of the gimbal, or of the aircraft.
 _ANGLE = re.compile(rf"\b(gb|gimbal|drone|flight|aircraft)[_. ]?(pitch|roll|yaw)(?:degree)?\s*:\s*{_NUMBER}", re.I)
 _CLOCK = re.compile(r"\d\s+(\d{1,2}):(\d\d):(\d\d[.,]\d{3})")
-_GPS = re.compile(rf"\bGPS\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I)
-_BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
+_GPS = re.compile(
+    rf"\b(?:GPS|RTK)\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I
+)
+_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
+#: Place of take-off, and the distance from it, m.
+_DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*{_NUMBER}\s*m")
+_METRES_PER_DEG = 111_320.0  # of latitude
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
 #: Pitch, roll and yaw; the degree sign may be in any encoding.
 _THREE = r"[^-+,()0-9]{0,8},\s*".join([_NUMBER] * 3)
@@ -56,6 +61,8 @@ class _Entry(NamedTuple):
 
     kind : of the height, "" = none
     clock_s : time of day
+    home : place of take-off in the order of the text, and the distance from it, m
+    plain : whether nothing beside the numbers says which of them is the latitude
     """
 
     stamp_ns: int
@@ -65,6 +72,8 @@ class _Entry(NamedTuple):
     body: tuple[float, float, float]
     lens: tuple[float, float]
     clock_s: float
+    home: tuple[float, float, float]
+    plain: bool
 
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
@@ -73,10 +82,15 @@ _UNKNOWN = (math.nan, math.nan, math.nan)
 def read_srt(path: Path) -> TelemetryLog:
     """Gimbal attitude and position of every subtitle, by the video's own clock."""
     entries = _entries(path)
-    stamps, places, kinds, gimbal, body, lens, clock_s = map(np.array, zip(*entries, strict=True))
+    stamps, places, kinds, gimbal, body, lens, clock_s, home, plain = map(np.array, zip(*entries, strict=True))
+    if _latitude_first(places, home, plain):
+        places[plain, :2] = places[plain, 1::-1]
     heights = next((kind for kind in _HEIGHTS if kind in kinds), "height")
     position = from_first_fix(_geodetic(places), above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
+    if position is None and np.isfinite(places[:, 0]).any():  # the Mavic 2 writes no height
+        position = from_first_fix(_geodetic(np.column_stack([places[:, :2], np.zeros(len(places))])))
+        lacks = [LogLack(Lack.HEIGHT_UNKNOWN)]
     real_s, shown_s = clock_s[-1] - clock_s[0], float(stamps[-1] - stamps[0]) * 1e-9
     if 1 < real_s < shown_s / 1.5:  # a second or more, and no rounding of the dates
         lacks.append(LogLack(Lack.SLOW, f"{shown_s / real_s:.1f}"))
@@ -93,8 +107,26 @@ def _entries(path: Path) -> list[_Entry]:
     found = (_entry(stamp_ns, text) for stamp_ns, text in read(path))
     entries = list(itertools.islice(filter(None, found), MAX_FRAMES + 1))
     if not 0 < len(entries) <= MAX_FRAMES:
-        raise InputError(f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}")
+        words = f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}"
+        raise InputError(words if entries else f"{words}; some models, as the Mavic Air, write none: use a flight log")
     return entries
+
+
+def _latitude_first(places: np.ndarray, home: np.ndarray, plain: np.ndarray) -> bool:
+    """Whether plain pairs, taken as longitude and latitude, are the other way round.
+
+    A latitude is below 90 degrees, and the distance from take-off fits one order.
+    """
+    latitude, longitude = places[plain, :2].T
+    if (np.abs(latitude) > 90).any():
+        return bool((np.abs(longitude) <= 90).all())
+    east, north = longitude - home[plain, 0], latitude - home[plain, 1]
+    off = [
+        np.abs(_METRES_PER_DEG * np.hypot(dx * np.cos(np.deg2rad(at)), dy) - home[plain, 2])
+        for dx, dy, at in ((east, north, latitude), (north, east, longitude))
+    ]
+    as_is, turned = (float(np.nansum(errors)) for errors in off)
+    return turned < 0.5 * as_is
 
 
 def _geodetic(places: np.ndarray) -> np.ndarray:
@@ -143,11 +175,13 @@ def _entry(stamp_ns: int, text: str) -> _Entry | None:
         if "yaw" in found and "pitch" in found:
             angles[of] = (found["pitch"], found.get("roll", 0.0), found["yaw"])
     kind = next((name for name in _HEIGHTS if name in values), "")
-    if not kind and not angles:
+    if not kind and not angles and "latitude" not in values:
         return None
     place = (values.get("latitude", math.nan), values.get("longitude", math.nan), values.get(kind, math.nan))
     gimbal, body = (angles.get(of, _UNKNOWN) for of in "GF")
-    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text))
+    way = _DISTANCE.search(text)
+    home = (float(way[1]), float(way[2]), float(way[3])) if way else _UNKNOWN
+    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text), home, "plain" in values)
 
 
 def _values(text: str) -> dict[str, float]:
@@ -160,7 +194,10 @@ def _values(text: str) -> dict[str, float]:
         latitude_first = gps[1].upper() in ("N", "S") if gps[1] else gps[6]
         names = ("latitude", "longitude") if latitude_first else ("longitude", "latitude")
         values |= {names[0]: _coordinate(gps[1], gps[2]), names[1]: _coordinate(gps[3], gps[4])}
-        values["altitude"] = float(gps[5])
+        if gps[6] or "." in gps[5]:  # else the number of satellites
+            values["altitude"] = float(gps[5])
+        if not gps[1] and not gps[6]:
+            values["plain"] = 1.0
     if barometer := _BAROMETER.search(text):
         values["barometer"] = float(barometer[1] or barometer[2])
     return values
