@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.file_kind import FileKind, file_kind
+from drocap_ros.file_kind import FileKind, file_kind, unpacking
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ class VideoSource(ImageSource):
         if not path.is_file():
             raise InputError(f"{path}: expected a video file, found no such file; check the path")
         if (kind := file_kind(path)) is not FileKind.VIDEO:
-            raise InputError(f"{path}: expected a video file, found {kind.value}; check the path, or record it again")
+            raise InputError(f"{path}: expected a video file, found {kind.value}{unpacking(path)}")
         self._error = pyav().error.FFmpegError
         try:
             self._container = open_container(path)

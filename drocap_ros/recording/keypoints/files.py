@@ -340,7 +340,7 @@ def read_keypoints(path: Path, stated: Stated = Stated()) -> Tracks:  # noqa: B0
 def _content(path: Path, *, own: bool) -> Content | Tracks:
     content, suffix = Content(), path.suffix.lower()
     if path.is_dir():
-        for file in sorted(path.glob("*.json"))[: MAX_FRAMES + 1]:
+        for file in sorted(path.glob("[!.]*.json"))[: MAX_FRAMES + 1]:
             content.frames.append(file.stem.removesuffix("_keypoints"))
             walk(json.loads(file.read_bytes()), content.frames[-1], content)
     elif suffix == ".json":
