@@ -29,7 +29,7 @@ from drocap_ros.perception.calibration import camera_model
 from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.recording.open_session import is_recording
 from drocap_ros.recording.telemetry import srt
-from drocap_ros.recording.telemetry.log import TelemetryLog, VehicleTrack, camera_attitude, with_camera
+from drocap_ros.recording.telemetry.log import Lack, TelemetryLog, VehicleTrack, camera_attitude, with_camera
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.video_tracks import stated_times
 from drocap_ros.tracks import Tracks
@@ -369,6 +369,8 @@ def with_telemetry(
     if reason:
         logger.warning("%s: camera telemetry incomplete: %s", name, reason)
     sources = {"file": name.name, "kind": log.kind, "time_offset": str(offset)}
+    if zoom := [str(lack) for lack in log.lacks if lack.kind is Lack.ZOOM]:
+        sources["zoom"] = zoom[0]
     camera = camera_model(ingest, tracks.image_size)
     if camera is None and log.lens is not None and tracks.camera_rotation is not None:
         fov_deg = log.lens.horizontal_fov_deg(tracks.image_size)

@@ -134,6 +134,7 @@ class MotionCheck(Enum):
         " path is not known. The player stands it on its lowest joint.",
     )
     ASSUMED_SCALE = ("Scale assumed", "Metres come from {source}{height}, not from a measurement.")
+    ZOOM = ("Lens changes", "{words}. Nothing checks the telemetry then; use a clip of one focal length.")
     TELEMETRY_REJECTED = ("Telemetry not used", "{words} The motion stays in the axes of the camera.")
     TELEMETRY_JUMPS = ("Reported position jumps", "{words}")
     CALIBRATION = ("Camera measured", "{words}")
@@ -259,6 +260,8 @@ def _of_frame(motion: Motion) -> Iterator[Finding]:
         height = motion.meta.get("assumed_height_m")
         assumed = f" of {height:.2f} m" if isinstance(height, int | float) else ""
         yield _note(MotionCheck.ASSUMED_SCALE, source=motion.scale_source.replace("_", " "), height=assumed)
+    if isinstance(source := motion.meta.get("telemetry"), dict) and "zoom" in source:
+        yield _warn(MotionCheck.ZOOM, words=str(source["zoom"]).capitalize())
     if words := telemetry_words(motion.meta):
         if "telemetry_rejected" in motion.meta:
             yield _warn(MotionCheck.TELEMETRY_REJECTED, words=words)

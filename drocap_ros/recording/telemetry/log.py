@@ -289,6 +289,12 @@ class Lens(NamedTuple):
     origin: str = f"{_USUAL_MM:g} mm equivalent assumed, as of most DJI main cameras"
     zoom: float = 1.0
 
+    @classmethod
+    def of_view(cls, fov_deg: float, origin: str) -> Lens:
+        """A lens by its horizontal field of view across the longer side of the image."""
+        focal_mm = 0.5 * _EQUIVALENT_WIDTH_MM / math.tan(math.radians(0.5 * fov_deg))
+        return cls(focal_mm, f"{fov_deg:g} deg across the image, {origin}")
+
     def __str__(self) -> str:
         return self.origin if self.zoom == 1.0 else f"{self.origin}, digital zoom {self.zoom:g}"
 

@@ -51,14 +51,18 @@ _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\
 _DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*{_NUMBER}\s*m")
 _METRES_PER_DEG = 111_320.0  # of latitude
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
+_VIEWS_DEG = (5.0, 170.0)  # possible fields of view
+#: Horizontal field of view, deg.
+_VIEW = re.compile(rf"\b(?:fov_?h|h_?fov|horizontal_?fov|fov_?horizontal)\s*[:=]\s*{_NUMBER}", re.IGNORECASE)
 #: Pitch, roll and yaw; the degree sign may be in any encoding.
 _THREE = r"[^-+,()0-9]{0,8},\s*".join([_NUMBER] * 3)
 _PRY = re.compile(rf"\b([FG])[._ ]?PRY\s*:?\s*\(\s*{_THREE}[^,()0-9]{{0,8}}\)", re.IGNORECASE)
 
 
 class _Entry(NamedTuple):
-    """One subtitle: time ns in the video; latitude, longitude deg and height m; pitch roll yaw deg; lens mm and zoom.
+    """One subtitle: time ns in the video; latitude, longitude deg and height m; pitch roll yaw deg.
 
+    lens : mm, digital zoom, view deg
     kind : of the height, "" = none
     clock_s : time of day
     home : place of take-off in the order of the text, and the distance from it, m
@@ -70,7 +74,7 @@ class _Entry(NamedTuple):
     kind: str
     gimbal: tuple[float, float, float]
     body: tuple[float, float, float]
-    lens: tuple[float, float]
+    lens: tuple[float, float, float]
     clock_s: float
     home: tuple[float, float, float]
     plain: bool
@@ -96,7 +100,9 @@ def read_srt(path: Path) -> TelemetryLog:
         lacks.append(LogLack(Lack.SLOW, f"{shown_s / real_s:.1f}"))
     steady = _lens(lens)
     if steady is None:
-        lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(np.nanprod(lens, axis=1)):.0f} mm" for f in (np.min, np.max))))
+        seen = lens[:, 2] if np.isfinite(lens[:, 2]).any() else np.nanprod(lens[:, :2], axis=1)
+        unit = "deg" if np.isfinite(lens[:, 2]).any() else "mm"
+        lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(seen):.0f} {unit}" for f in (np.nanmin, np.nanmax))))
     attitudes = {"orientation": dji_attitude(body), "gimbal": dji_attitude(gimbal)}
     log = make_log(path, "DJI subtitles", stamps, lacks, position=position, **attitudes)
     return log._replace(video_clock=True, lens=steady)
@@ -213,23 +219,27 @@ def _clock_s(text: str) -> float:
     return 3600 * int(found[1]) + 60 * int(found[2]) + float(found[3].replace(",", ".")) if found else math.nan
 
 
-def _focal(text: str) -> tuple[float, float]:
-    """35 mm equivalent in mm and digital zoom, NaN and 1 where the subtitle has none."""
+def _focal(text: str) -> tuple[float, float, float]:
+    """35 mm equivalent in mm, digital zoom and horizontal view in deg; NaN, 1 and NaN where the subtitle has none."""
     found = {name.lower(): number for name, number in _LENS.findall(text)}
-    focal, zoom = found.get("focal_len", "nan"), found.get("dzoom_ratio", "1")
+    focal, zoom, view = found.get("focal_len", "nan"), found.get("dzoom_ratio", "1"), _VIEW.search(text)
     # Without a decimal point they count tenths of a mm and ten thousandths.
     factor = 1.0 if "." in zoom or float(zoom) < 100 else 1e-4
-    return float(focal) * (1.0 if "." in focal else 0.1), float(zoom) * factor
+    return float(focal) * (1.0 if "." in focal else 0.1), float(zoom) * factor, float(view[1]) if view else math.nan
 
 
 def _lens(values: np.ndarray) -> Lens | None:
-    """The lens of all subtitles (N, 2); the usual one where they state none; None where it changes."""
-    stated = values[(values[:, 0] >= 5) & (values[:, 0] <= 1000) & (values[:, 1] >= 1) & (values[:, 1] <= 100)]
+    """The lens of all subtitles (N, 3); the usual one where they state none; None where it changes."""
+    view = values[(values[:, 2] >= _VIEWS_DEG[0]) & (values[:, 2] <= _VIEWS_DEG[1]), 2]
+    stated = values[(values[:, 0] >= 5) & (values[:, 0] <= 1000) & (values[:, 1] >= 1) & (values[:, 1] <= 100), :2]
+    for each in (view[:, None], stated):
+        if len(each) and (np.ptp(each, axis=0) > 0.01 * np.median(each, axis=0)).any():
+            return None
+    if len(view):
+        return Lens.of_view(float(np.median(view)), "as the subtitles state")
     if not len(stated):
         return Lens()
     focal, zoom = np.median(stated, axis=0)
-    if (np.ptp(stated, axis=0) > 0.01 * np.array([focal, zoom])).any():
-        return None
     return Lens(float(focal), f"{focal:g} mm equivalent of the subtitles, full sensor width assumed", float(zoom))
 
 

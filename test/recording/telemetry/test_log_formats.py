@@ -230,6 +230,18 @@ def test_zoom_during_a_clip_is_said(tmp_path, capsys):
     assert "the zoom changes (24 mm to 48 mm)" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["fov_h", "hfov", "h_fov", "fovH", "horizontal_fov"])
+@pytest.mark.parametrize("degrees", [24.5, 66.0, 84.2])
+def test_a_field_of_view_in_subtitles_is_the_lens(tmp_path, name, degrees):
+    rows = ["[focal_len: 24.00] [rel_alt: 5.0] [gb_yaw: 1.0 gb_pitch: -9.0] [" + f"{name}: {{}}]"] * 20
+    (tmp_path / "v.srt").write_text(srt_text(np.arange(20.0), [row.format(degrees) for row in rows]))
+    assert read_telemetry(tmp_path / "v.srt").lens.horizontal_fov_deg((1920, 1080)) == pytest.approx(degrees)
+    (tmp_path / "z.srt").write_text(srt_text(np.arange(20.0), [r.format(degrees + i) for i, r in enumerate(rows)]))
+    log = read_telemetry(tmp_path / "z.srt")
+    assert log.lens is None
+    assert f"the zoom changes ({degrees:.0f} deg to" in str(log.lacks[-1])
+
+
 @pytest.mark.parametrize("name", ["x.tlog", "x.ulg", "x.bin", "x.srt", "x.txt"])
 @pytest.mark.parametrize("content", [b"", b"no log at all\n" * 300, bytes(3000), b"ULog\x01\x12\x35" + bytes(100)])
 def test_files_that_are_no_log_are_refused_in_one_line(tmp_path, capfd, name, content):
