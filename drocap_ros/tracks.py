@@ -234,7 +234,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
             if size > MAX_BYTES:
                 raise InputError(f"{path}: expected at most {MAX_BYTES} bytes of arrays, got {size}; cut the recording")
             if len(entries) > _MOST_ARRAYS:
-                raise InputError(f"{path}: expected at most {_MOST_ARRAYS} arrays, got {len(entries)}; check the path")
+                raise InputError(f"{path}: expected at most {_MOST_ARRAYS} arrays, got {len(entries)}; check the file")
             for entry in entries:
                 _check_declared(archive.zip, entry)
             return {name: archive[name] for name in archive.files}
@@ -259,7 +259,7 @@ def _check_kind(path: Path) -> None:
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: expected a readable .npz archive, found a pipe or device; name a file")
     if path.is_file() and not zipfile.is_zipfile(path):
-        raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the path")
+        raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the file")
 
 
 def _reason(error: Exception) -> str:

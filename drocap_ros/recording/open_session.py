@@ -88,7 +88,7 @@ class McapSession(Session):
         for file in files:
             with file.open("rb") as opened:
                 if opened.read(len(MAGIC)) != MAGIC:
-                    raise InputError(f"{file}: expected an MCAP file, found other content at its start; check the path")
+                    raise InputError(f"{file}: expected an MCAP file, found other content at its start; check the file")
 
     def raw_messages(self, topics: Collection[str] = ()) -> Iterator[RawMessage]:
         """Messages of some topics (default: all) in the order of the files."""
