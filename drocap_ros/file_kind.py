@@ -70,6 +70,18 @@ def file_kind(path: Path) -> FileKind:
     return found or (FileKind.TEXT if _is_text(head) else FileKind.OTHER)
 
 
+#: A stream's or web page's address, whose slashes a path has lost.
+_ADDRESS = re.compile(r"([a-z]+):/+(?=[^/])", re.IGNORECASE)
+
+
+def missing(path: Path, expected: str) -> InputError:
+    """The refusal of a path where nothing is, or of an address in its place."""
+    if _ADDRESS.match(str(path)):
+        address = _ADDRESS.sub(r"\1://", str(path), count=1)
+        return InputError(f"{address}: expected {expected}, found an address; download the file and name it")
+    return InputError(f"{path}: expected {expected}, found no such file or folder; check the path")
+
+
 #: Ends of the names of packed files -> the command that unpacks one.
 _UNPACK = {
     ".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".tgz": "tar -xf", ".tar": "tar -xf", ".bz2": "bunzip2",

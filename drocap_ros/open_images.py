@@ -15,6 +15,7 @@ from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.perception.sources import Frame, open_source
 from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.recording.image_messages import choose_images, read_images
+from drocap_ros.recording.keypoints.files import is_keypoint_file
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
 
@@ -93,6 +94,11 @@ def refuse_other_inputs(path: Path) -> None:
         raise InputError(
             f"{path}: expected a video, image folder, recording or tracks file, found the folder of a motion;"
             f" `drocap report {path}` shows it{hint}"
+        )
+    if path.suffix != ".npz" and is_keypoint_file(path):
+        raise InputError(
+            f"{path}: expected a video, image folder, recording or tracks file, found 2D keypoints; `drocap reconstruct"
+            f" {path}` takes them"
         )
     if path.suffix.lower() in LOG_SUFFIXES:
         raise InputError(

@@ -14,6 +14,7 @@ import numpy as np
 
 from drocap_ros.background import Background, read_background
 from drocap_ros.errors import InputError, first_line
+from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.geometry.rotations import MOST_ASPECT, pixels_are_usual
 from drocap_ros.stamps import as_stamps, check_stamps
 
@@ -23,6 +24,7 @@ MAX_FRAMES = 1_080_000
 MAX_BYTES = 4 * 2**30
 #: Arrays of a file: its kinds have some twenty.
 _MOST_ARRAYS = 1000
+_NAMED = 5  # of them in a message
 #: Keypoints beyond it are no pixels, and their squares overflow in the solvers.
 _FARTHEST_PX = 1e9
 #: Keypoints that are all within it are shares of the image, not px.
@@ -221,6 +223,10 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
         kind, wanted = kind_of(arrays), kind_of(required)
         if kind and wanted and kind != wanted:
             raise wrong_kind(path, arrays, _USES[wanted][0])
+        if len(missing) == len(required):
+            there = ", ".join(list(arrays)[:_NAMED]) or "none"
+            wanted = _USES[kind_of(required)][0] if kind_of(required) else f"arrays as {', '.join(required[:_NAMED])}"
+            raise InputError(f"{path}: expected {wanted}, found an archive of other arrays ({there}); check the file")
         raise InputError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
     return arrays
 
@@ -259,7 +265,9 @@ def _check_kind(path: Path) -> None:
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: expected a readable .npz archive, found a pipe or device; name a file")
     if path.is_file() and not zipfile.is_zipfile(path):
-        raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the file")
+        kind = file_kind(path)
+        found = "a damaged one" if kind in (FileKind.ARRAYS, FileKind.OTHER) else kind.value
+        raise InputError(f"{path}: expected a readable .npz archive, found {found}; check the file")
 
 
 def _reason(error: Exception) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from drocap_ros.cli.options import Subparsers, add_command, table_lines
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import missing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -164,8 +165,9 @@ def run(args: argparse.Namespace) -> int:
 def summarize(path: Path) -> Summary:
     """Content of a file or folder."""
     if not (path.is_file() or path.is_dir()):  # a named pipe would be waited for
-        found = "a pipe or device" if path.exists() else "no such file"
-        raise InputError(f"{path}: expected a recording, motion or tracks file, found {found}; check the path")
+        if not path.exists():
+            raise missing(path, "a recording, motion or tracks file")
+        raise InputError(f"{path}: expected a recording, motion or tracks file, found a pipe or device; name a file")
     path = _motion_in(path)
     from drocap_ros.recording.keypoints.files import is_keypoint_file
 

@@ -227,8 +227,11 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
 
 
 def _telemetry(args: argparse.Namespace) -> Telemetry:
-    from drocap_ros.recording.video_telemetry import Telemetry
+    from drocap_ros.recording.telemetry.read import split_choice
+    from drocap_ros.recording.video_telemetry import NO_TELEMETRY, Telemetry
 
+    if args.telemetry not in (None, NO_TELEMETRY) and not split_choice(args.telemetry)[0].exists():
+        raise InputError(f"--telemetry {args.telemetry}: expected a log, found no such file; check the path")
     if args.time_offset is not None:
         _check_offset("--time-offset", args.time_offset, args, mount=False)
     if args.mount_pitch is not None:

@@ -48,8 +48,12 @@ def choose_images(session: Session, wanted: str = "") -> TopicInfo:
             if topic.name.strip("/") == wanted.strip("/"):
                 return topic
         raise InputError(f"--topic {wanted}: expected a topic with images, found {names or 'none'}; correct the name")
+    if not found:
+        there = ", ".join(f"{t.name} ({t.type_name})" for t in session.info.topics if t.count)
+        there = there or ("no messages" if session.info.topics else "no topics")
+        raise InputError(f"{session.path}: expected a topic with images, found {there}; record one")
     if len(found) < 2:
-        return session.choose_topic(*IMAGES)
+        return found[0]
     by_rank: dict[int, list[TopicInfo]] = {}
     for topic in found:
         by_rank.setdefault(_rank(session, topic), []).append(topic)

@@ -173,6 +173,9 @@ class VideoSource(ImageSource):
         """Choose the track, read what the container states, and the first picture."""
         known = [stream for stream in self._container.streams.video if stream.codec_context is not None]
         known = [s for s in known if not s.disposition & s.disposition.attached_pic] or known
+        if not known and self._container.streams.audio and not self._container.streams.video:
+            self.close()
+            raise InputError(f"{self.path}: expected a video, found sound without pictures; name the video")
         if not known:
             raise self._refused(f"no video of a known codec ({', '.join(track_codes(self.path)) or 'no track'})")
         self._stream = self._chosen(known)
