@@ -36,6 +36,12 @@ _VECTORS: list[tuple[dict[str, float], tuple[float, float, float, float]]] = [
 _MODEL = np.array([vector for _, vector in _VECTORS])
 _PLACES = (*LIMB_JOINTS, "face")
 _WEIGHTS = np.array([[of.get(joint, 0.0) for joint in _PLACES] for of, _ in _VECTORS])
+#: A person who stands, as shares of the stature: parts of a body are less spread than all of it.
+_STANDING = np.array(
+    [(side * across, down) for part, side in ((name[1:], 1 if name[0] == "l" else -1) for name in LIMB_JOINTS)
+     for across, down in [{"hip": (0.05, 0.0), "knee": (0.05, 0.17), "ankle": (0.05, 0.34), "shoulder": (0.07, -0.22),
+                           "elbow": (0.09, -0.13), "wrist": (0.09, -0.11)}[part]]] + [(0.0, -0.33)]
+)  # fmt: skip
 #: Points of the head, the one that is most often seen first.
 _HEADS = ("nose", "head", "head_top", "left_eye", "right_eye", "left_ear", "right_ear", "crown")
 #: Statures that are tried, as multiples of the points' deviation from their middle.
@@ -66,6 +72,7 @@ _MOST_LEAD, _LEAST = (0.12, 0.1), (0.3, 0.4)
 #: Difference of the logarithms of lengths of both sides, beyond which it takes off a share of the likelihood: a hand
 #: near the camera reaches it.
 _UNEVEN, _UNEVEN_SHARE = 0.6, 0.6
+_A_WHILE = 8  # frames that are looked at, with fewer of which this says nothing
 
 
 def limbs_of(names: Sequence[str]) -> dict[str, int]:
@@ -98,11 +105,12 @@ def is_no_body(xy: np.ndarray, names: Sequence[str], *, strict: bool = False) ->
     frames, joints = _limb_points(xy, names)
     if not len(frames):
         return strict
-    spread = _spread(joints)
-    found = _likelihood(joints, spread)
     seen = np.isfinite(joints[..., 0])
+    spread = _spread(joints) / _spread(np.where(seen[..., None], _STANDING, np.nan)) * _spread(_STANDING[None])
+    found = _likelihood(joints, spread)
     uneven = max((abs(np.log(_length(joints, "l", *bone) / _length(joints, "r", *bone))) for limb in _LIMBS
                   for bone in itertools.pairwise(limb)), default=0.0)  # fmt: skip
+    uneven = uneven if len(joints) >= _A_WHILE else 0.0
     if found.mean() - _UNEVEN_SHARE * max(np.nan_to_num(uneven) - _UNEVEN, 0.0) < _LEAST[strict]:
         return True
     for pairs in _EXCHANGES:
@@ -113,7 +121,9 @@ def is_no_body(xy: np.ndarray, names: Sequence[str], *, strict: bool = False) ->
         both = seen[:, moved].all(axis=1)  # without those the number of known bones would differ
         if both.sum() >= min(_LEAST_FRAMES, len(both)):
             exchanged = _likelihood(joints[both][:, order], spread[both])
-            if exchanged.mean() > found[both].mean() + _MOST_LEAD[strict]:
+            known = (~(~seen[both] @ (_WEIGHTS != 0).T)).mean()  # where few bones are seen each counts more
+            margin = _MOST_LEAD[strict] * (1 + 2 / both.sum()) / known  # one pose says less than many
+            if exchanged.mean() > found[both].mean() + margin:
                 return True
     return False
 

@@ -92,3 +92,17 @@ def test_spellings_of_a_joint():
     for name in ("RHip", "hip_R", "Hip.right", "rightHip", "right-hip", "r_hip"):
         assert joint_name(name) == "right_hip"
     assert joint_name("left_foot_index") == "left_big_toe"
+
+
+@pytest.mark.parametrize("seen", ["upper body", "without ankles", "left side half", "one frame"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_part_of_a_body_is_not_doubted(seen, seed):
+    rng = np.random.default_rng(seed)
+    points = in_order(views(ACTIONS[seed], seed, start_deg=80 * seed)[2], "coco17", rng, 2.0)
+    if seen == "one frame":
+        points = points[40:41]
+    elif seen == "left side half":
+        points[::2, 1::2] = np.nan
+    else:
+        points[:, 11 if seen == "upper body" else 15 :] = np.nan
+    assert not is_no_body(points, ORDERS["coco17"], strict=True)
