@@ -24,6 +24,7 @@ class FileKind(Enum):
     SQLITE = "an SQLite recording"
     ARRAYS = "a zip archive or arrays"
     TEXT = "text"
+    PACKED = "a packed file"
     EMPTY = "0 bytes"
     OTHER = "no header of a video"
 
@@ -40,6 +41,7 @@ _HEADS = [
         (FileKind.ROSBAG1, rb"#ROSBAG V"),
         (FileKind.SQLITE, rb"SQLite format 3\x00"),
         (FileKind.ARRAYS, rb"PK\x03\x04|PK\x05\x06|\x93NUMPY"),
+        (FileKind.PACKED, rb"\x28\xb5\x2f\xfd|\x1f\x8b|BZh[1-9]|\xfd7zXZ\0|\x04\x22\x4d\x18|7z\xbc\xaf\x27\x1c|Rar!"),
         # JPEG, PNG, TIFF, BMP, WebP, PNM; OpenEXR, Radiance, JPEG 2000, HEIF and AVIF
         (FileKind.IMAGE, rb"\xff\xd8\xff|\x89PNG\r\n|II\*\0|MM\0\*|BM....\0\0\0\0|RIFF....WEBP|P[1-7]\s"),
         (FileKind.IMAGE, rb"\x76\x2f\x31\x01|#\?RADIANCE|\0\0\0\x0cjP  |....ftyp(heic|heix|mif1|msf1|avif)"),
@@ -66,6 +68,31 @@ def file_kind(path: Path) -> FileKind:
     if found is FileKind.VIDEO and begins != _Y4M and _is_text(begins) and _is_text(head):
         return FileKind.TEXT  # "The free text" begins as a box `free` does
     return found or (FileKind.TEXT if _is_text(head) else FileKind.OTHER)
+
+
+#: A stream's or web page's address, whose slashes a path has lost.
+_ADDRESS = re.compile(r"([a-z]+):/+(?=[^/])", re.IGNORECASE)
+
+
+def missing(path: Path, expected: str) -> InputError:
+    """The refusal of a path where nothing is, or of an address in its place."""
+    if _ADDRESS.match(str(path)):
+        address = _ADDRESS.sub(r"\1://", str(path), count=1)
+        return InputError(f"{address}: expected {expected}, found an address; download the file and name it")
+    return InputError(f"{path}: expected {expected}, found no such file or folder; check the path")
+
+
+#: Ends of the names of packed files -> the command that unpacks one.
+_UNPACK = {
+    ".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".tgz": "tar -xf", ".tar": "tar -xf", ".bz2": "bunzip2",
+    ".xz": "unxz", ".lz4": "unlz4", ".zip": "unzip", ".7z": "7z x", ".rar": "unrar x",
+}  # fmt: skip
+
+
+def unpacking(path: Path) -> str:
+    """What to do with a file that is none of the kinds that are read, after a sentence about it."""
+    command = _UNPACK.get(path.suffix.lower())
+    return f"; unpack it: {command} {path}" if command else "; check the file, or record it again"
 
 
 def _is_text(head: bytes) -> bool:

@@ -11,9 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.perception.sources import Frame, open_source
 from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.recording.image_messages import choose_images, read_images
+from drocap_ros.recording.keypoints.files import is_keypoint_file
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
 
@@ -46,7 +48,8 @@ class Images(NamedTuple):
 def open_images(source: str | Path, config: ImageIngestConfig | None = None, topic: str = "") -> Iterator[Images]:
     """Open a video file, image, folder of images, stream or recording; warnings of a recording are logged at the end.
 
-    topic : of a recording; empty: that of :func:`drocap_ros.recording.image_messages.choose_images`
+    topic : of a recording; empty: that of :func:`drocap_ros.recording.image_messages.choose_images`; of a video the
+        number of its track; empty: the largest
     """
     path = Path(source)
     if path.exists():
@@ -58,9 +61,9 @@ def open_images(source: str | Path, config: ImageIngestConfig | None = None, top
             for warning in session.warnings:
                 logger.warning("%s: %s", path, warning)
         return
-    if topic:
+    if topic and not (path.is_file() and file_kind(path) is FileKind.VIDEO):
         raise InputError(f"--topic {topic}: expected a recording with topics, found {source}; leave the option out")
-    with open_source(source, config) as images:
+    with open_source(source, config, topic) as images:
         yield Images(_visible(source, images), images.length, images.duration_s)
 
 
@@ -91,6 +94,11 @@ def refuse_other_inputs(path: Path) -> None:
         raise InputError(
             f"{path}: expected a video, image folder, recording or tracks file, found the folder of a motion;"
             f" `drocap report {path}` shows it{hint}"
+        )
+    if path.suffix != ".npz" and is_keypoint_file(path):
+        raise InputError(
+            f"{path}: expected a video, image folder, recording or tracks file, found 2D keypoints; `drocap reconstruct"
+            f" {path}` takes them"
         )
     if path.suffix.lower() in LOG_SUFFIXES:
         raise InputError(

@@ -15,6 +15,7 @@ from pathlib import Path
 from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import missing
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.motion import Motion
 from drocap_ros.open_images import open_images, refuse_other_inputs
@@ -151,7 +152,7 @@ def with_origin(motion: Motion, path: Path, origin: Values, seconds: float) -> M
 def needs_networks(path: Path, redetect: bool) -> bool:
     """Whether the 2D poses of an input have to be estimated from its images."""
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder; check the path")
+        raise missing(path, "a video, folder of images, recording or tracks file")
     refuse_other_inputs(path)
     if path.suffix == ".npz":
         return False
@@ -318,7 +319,8 @@ def reconstruct_together(
         tracks.append(own)
         solved.append(solve(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress))
     begin = time.perf_counter()
-    motions = join_views(solved, [path.name for path in paths])
+    names = [path.name for path in paths]
+    motions = join_views(solved, [p.name if names.count(p.name) == 1 else f"{p.parent.name}/{p.name}" for p in paths])
     took = time.perf_counter() - begin
     for motion in motions:
         alone = motion.meta["seconds"]

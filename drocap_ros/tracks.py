@@ -14,6 +14,7 @@ import numpy as np
 
 from drocap_ros.background import Background, read_background
 from drocap_ros.errors import InputError, first_line
+from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.geometry.rotations import MOST_ASPECT, pixels_are_usual
 from drocap_ros.stamps import as_stamps, check_stamps
 
@@ -23,12 +24,17 @@ MAX_FRAMES = 1_080_000
 MAX_BYTES = 4 * 2**30
 #: Arrays of a file: its kinds have some twenty.
 _MOST_ARRAYS = 1000
+_NAMED = 5  # of them in a message
 #: Keypoints beyond it are no pixels, and their squares overflow in the solvers.
 _FARTHEST_PX = 1e9
 #: Keypoints that are all within it are shares of the image, not px.
 _NORMALISED = 2.0
 #: Share of the picture's size beyond its edge at which networks still place joints of a person who is cut off.
 _OUTSIDE = 0.1
+#: Share of keypoints outside the picture from which they are none of it, as 3D poses about the hips.
+_MOST_OUTSIDE = 0.4
+#: Scores a little above 1 are usual; COCO's flags end at 2.
+_HIGHEST_SCORE = 2.0
 #: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
 _FOCAL_SHARES = (0.1, 100.0)
 
@@ -217,6 +223,10 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
         kind, wanted = kind_of(arrays), kind_of(required)
         if kind and wanted and kind != wanted:
             raise wrong_kind(path, arrays, _USES[wanted][0])
+        if len(missing) == len(required):
+            there = ", ".join(list(arrays)[:_NAMED]) or "none"
+            wanted = _USES[kind_of(required)][0] if kind_of(required) else f"arrays as {', '.join(required[:_NAMED])}"
+            raise InputError(f"{path}: expected {wanted}, found an archive of other arrays ({there}); check the file")
         raise InputError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
     return arrays
 
@@ -230,7 +240,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
             if size > MAX_BYTES:
                 raise InputError(f"{path}: expected at most {MAX_BYTES} bytes of arrays, got {size}; cut the recording")
             if len(entries) > _MOST_ARRAYS:
-                raise InputError(f"{path}: expected at most {_MOST_ARRAYS} arrays, got {len(entries)}; check the path")
+                raise InputError(f"{path}: expected at most {_MOST_ARRAYS} arrays, got {len(entries)}; check the file")
             for entry in entries:
                 _check_declared(archive.zip, entry)
             return {name: archive[name] for name in archive.files}
@@ -255,7 +265,9 @@ def _check_kind(path: Path) -> None:
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: expected a readable .npz archive, found a pipe or device; name a file")
     if path.is_file() and not zipfile.is_zipfile(path):
-        raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the path")
+        kind = file_kind(path)
+        found = "a damaged one" if kind in (FileKind.ARRAYS, FileKind.OTHER) else kind.value
+        raise InputError(f"{path}: expected a readable .npz archive, found {found}; check the file")
 
 
 def _reason(error: Exception) -> str:
@@ -275,6 +287,7 @@ def load_tracks(path: str | Path) -> Tracks:
         more = {name: _as_float(arrays[name], name) for name in _OPTIONAL if name in arrays}
         xy = _as_float(arrays["keypoints"], "keypoints")
         if xy.ndim == 3 and xy.shape[2] == 3:  # x, y, score
+            _check_scores(xy[..., 2])
             more.setdefault("confidence", np.clip(np.nan_to_num(xy[..., 2]), 0.0, 1.0))
             xy = xy[..., :2]
         return Tracks(
@@ -290,11 +303,27 @@ def load_tracks(path: str | Path) -> Tracks:
         raise InputError(f"{path}: {error}") from None
 
 
+def _check_scores(scores: np.ndarray) -> None:
+    low, high = np.nanmin(scores, initial=0.0), np.nanmax(scores, initial=0.0)
+    if low < 0 or high > _HIGHEST_SCORE:
+        raise InputError(
+            f"keypoints: expected x, y px and a score from 0 to 1, found {low:g} to {high:g} in the third column, as of"
+            " 3D poses; give the 2D keypoints of the pictures"
+        )
+
+
 def without_unseen(path: Path, xy: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Keypoints (F, P, 2) with NaN for zeros, pairs below zero and places far outside, as other tools mark them."""
     unseen = np.asarray((xy <= 0).all(axis=2)) | ((xy < -_OUTSIDE * size) | (xy > (1 + _OUTSIDE) * size)).any(axis=2)
     if not unseen.any() or unseen.all():
         return xy
+    placed = np.isfinite(xy).all(axis=2) & (xy != 0).any(axis=2) & (xy != -1).any(axis=2)
+    share = (unseen & placed).sum() / max(placed.sum(), 1)
+    if share > _MOST_OUTSIDE:
+        raise InputError(
+            f"keypoints: expected px of an image of {size[0]}x{size[1]}, found {share:.0%} of them outside; convert"
+            " them, from its upper left corner"
+        )
     logging.getLogger(__name__).warning("%s: %d keypoints at (0, 0) or outside are not seen", path, unseen.sum())
     return np.where(unseen[..., None], np.nan, xy)
 

@@ -130,3 +130,12 @@ def test_file_that_declares_more_than_it_holds_is_refused_at_once(tmp_path):
                 archive.writestr(name, data)
         with pytest.raises(InputError, match=r"declares 1000000000000 values|at most 1000 arrays"):
             load_tracks(path)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+@pytest.mark.parametrize("columns", [2, 3])
+def test_poses_in_space_are_no_keypoints(tmp_path, unit, columns):
+    points = unit * np.random.default_rng(0).normal(0, 0.5, (20, 15, 3))
+    np.savez(tmp_path / "t.npz", **{**arrays(20), "keypoints": points[..., :columns]})
+    with pytest.raises(InputError, match="3D poses" if columns == 3 else "expected px of an image of 640x480"):
+        load_tracks(tmp_path / "t.npz")

@@ -43,6 +43,13 @@ def _add_compare(kinds: Subparsers) -> None:
     add_motion_argument(parser)
     truth = "MoCap .npz, .c3d, .trc or .bvh, another motion.npz, or a folder with truth.npz (or .c3d ...) or motion.npz"
     parser.add_argument("truth", metavar="TRUTH", type=Path, help=truth)
+    parser.add_argument(
+        "--time-offset",
+        metavar="S|find",
+        type=lambda text: float("nan") if text == "find" else float(text),
+        help="seconds from the truth's first frame to the motion's; find: by the poses (default: by the clocks of both,"
+        " where their times overlap, else find)",
+    )
     add_out(parser, "compare.csv, compare.md and compare.png")
     parser.set_defaults(run=_compare)
 
@@ -76,7 +83,7 @@ def _compare(args: argparse.Namespace) -> int:
 
     check_out(args)
     path, motion = read_motion(args.motion)
-    errors = compare(motion, *load_truth(args.truth))
+    errors = compare(motion, *load_truth(args.truth), offset_s=args.time_offset)
     name = path.parent.name if path.name == "motion.npz" else path.stem
     record = {"motion": name, **tables.errors_record(errors)}
     words = tables.comparison_markdown(name, errors)

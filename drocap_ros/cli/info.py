@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from drocap_ros.cli.options import Subparsers, add_command, table_lines
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import missing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,7 +26,8 @@ _VIDEOS = (".mp4", ".mov", ".lrf")
 #: Codes of the registry of ISO/IEC 14496-12 in words.
 _FORMATS = {
     "avc1": "H.264", "hvc1": "H.265", "hev1": "H.265", "vp09": "VP9", "av01": "AV1", "mp4v": "MPEG-4", "jpeg": "JPEG",
-    "mp4a": "AAC", "djmd": "DJI telemetry", "dbgi": "DJI debugging data", "mebx": "metadata", "tmcd": "time code",
+    "mp4a": "AAC", "djmd": "DJI telemetry", "gpmd": "GoPro telemetry",
+    "dbgi": "DJI debugging data", "mebx": "metadata", "tmcd": "time code",
 }  # fmt: skip
 
 
@@ -113,7 +115,7 @@ def _log_facts(log: TelemetryLog) -> list[tuple[str, str]]:
         facts.append(("on video", parts))
     if log.lens is not None:
         facts.append(("lens", str(log.lens)))
-    return facts + [("missing", str(lack)) for lack in log.lacks]
+    return facts + [("note", str(lack)) for lack in log.lacks]
 
 
 def _rows(log: TelemetryLog) -> list[tuple[str, ...]]:
@@ -163,8 +165,9 @@ def run(args: argparse.Namespace) -> int:
 def summarize(path: Path) -> Summary:
     """Content of a file or folder."""
     if not (path.is_file() or path.is_dir()):  # a named pipe would be waited for
-        found = "a pipe or device" if path.exists() else "no such file"
-        raise InputError(f"{path}: expected a recording, motion or tracks file, found {found}; check the path")
+        if not path.exists():
+            raise missing(path, "a recording, motion or tracks file")
+        raise InputError(f"{path}: expected a recording, motion or tracks file, found a pipe or device; name a file")
     path = _motion_in(path)
     from drocap_ros.recording.keypoints.files import is_keypoint_file
 

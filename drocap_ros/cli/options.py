@@ -155,7 +155,11 @@ def add_clip_options(parser: argparse.ArgumentParser) -> None:
         " centre, or a box x_min,y_min,x_max,y_max px in the first image",
     )
     parser.add_argument(
-        "--topic", metavar="NAME", default="", help="topic of the images of a recording (default: colour before grey)"
+        "--topic",
+        metavar="NAME",
+        default="",
+        help="topic of the images of a recording (default: colour before grey), or number of a video's track (default:"
+        " the largest)",
     )
 
 

@@ -86,8 +86,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--telemetry",
         metavar="LOG",
         type=Path,
-        help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt, Airdata .csv (default: the DJI"
-        " track inside the video, else the .SRT of its name); none: no telemetry, nor that of a session or tracks file",
+        help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt, Airdata .csv, .gpx (default: the"
+        " DJI track inside the video, else the .SRT of its name); LOG#NAME chooses one of several vehicles or mounts;"
+        " none: no telemetry, nor that of a session or tracks file",
     )
     parser.add_argument(
         "--time-offset",
@@ -138,6 +139,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--image-size", metavar="WxH", type=image_size, help="px, where a file of keypoints does not say it"
     )
+    parser.add_argument(
+        "--order",
+        metavar="NAME",
+        help="order of the joints in a file of keypoints that does not name them, as coco17, h36m17, openpose25 or"
+        " mediapipe33 (default: the one that makes a body)",
+    )
     add_network_options(parser)
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     add_config_option(parser)
@@ -165,7 +172,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
     from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
-    from drocap_ros.recording.keypoints.files import as_tracks_file
+    from drocap_ros.recording.keypoints.files import Stated, as_tracks_file
     from drocap_ros.report.motion_images import ImagesBeside, has_images
 
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
@@ -177,7 +184,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     telemetry = _telemetry(args)
     with (
-        as_tracks_file(args.input, args.rate, args.image_size) as source,
+        as_tracks_file(args.input, Stated(args.rate, args.image_size, args.order)) as source,
         progress_bars(args.quiet, _SHARES) as progress,
     ):
         if needs_networks(source, args.redetect):
@@ -220,8 +227,11 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
 
 
 def _telemetry(args: argparse.Namespace) -> Telemetry:
-    from drocap_ros.recording.video_telemetry import Telemetry
+    from drocap_ros.recording.telemetry.read import split_choice
+    from drocap_ros.recording.video_telemetry import NO_TELEMETRY, Telemetry
 
+    if args.telemetry not in (None, NO_TELEMETRY) and not split_choice(args.telemetry)[0].exists():
+        raise InputError(f"--telemetry {args.telemetry}: expected a log, found no such file; check the path")
     if args.time_offset is not None:
         _check_offset("--time-offset", args.time_offset, args, mount=False)
     if args.mount_pitch is not None:
@@ -306,7 +316,7 @@ def run_together(args: argparse.Namespace) -> int:
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.pipeline import needs_networks, reconstruct_together
-    from drocap_ros.recording.keypoints.files import as_tracks_file
+    from drocap_ros.recording.keypoints.files import Stated, as_tracks_file
     from drocap_ros.recording.video_telemetry import Telemetry
     from drocap_ros.report.motion_images import ImagesBeside, has_images
 
@@ -319,7 +329,9 @@ def run_together(args: argparse.Namespace) -> int:
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     with contextlib.ExitStack() as stack:
-        sources = [stack.enter_context(as_tracks_file(path, args.rate, args.image_size)) for path in inputs]
+        sources = [
+            stack.enter_context(as_tracks_file(path, Stated(args.rate, args.image_size, args.order))) for path in inputs
+        ]
         progress = stack.enter_context(progress_bars(args.quiet))
         for source in sources:
             if needs_networks(source, redetect=False):

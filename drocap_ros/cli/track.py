@@ -147,7 +147,10 @@ def _track(job: _Job) -> str:
 
         frames = selection.clip.select(images.frames)
         observations = observe(frames, estimator, on_frame, begin_ns, args.threads)
-    tracks_from_observations(observations)  # raises for a recording without a person
+    try:
+        tracks_from_observations(observations)
+    except InputError as error:  # a recording without a person, or without images
+        raise InputError(f"{args.video}: {error}") from None
     found = subjects(observations)
     begin, changes = observations[0].stamp_ns, list(estimator.tracker.changes)[1:]
     for rank, (track_id, _) in enumerate(found):

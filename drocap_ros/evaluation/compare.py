@@ -10,7 +10,9 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation import metrics
+from drocap_ros.evaluation.time_offset import find_offset
 from drocap_ros.evaluation.truth_files import load_mocap, read_truth_file
+from drocap_ros.file_kind import file_kind
 from drocap_ros.motion import Motion, load_motion, motion_file
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, in_body_order, indices
 from drocap_ros.tracks import kind_of, read_npz, wrong_kind
@@ -138,8 +140,17 @@ def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]
         path = motion_file(truth, *(f"truth{suffix}" for suffix in TRUTH_SUFFIXES))
         if path.is_file() and (found := read_truth_file(path)) is not None:
             return *found, "world"
+        if path.is_file() and path.suffix.lower() != ".npz":
+            raise InputError(
+                f"{path}: expected a truth as MoCap .npz, .c3d, .trc, .bvh or a motion.npz, found"
+                f" {file_kind(path).value}; convert it (FBX to BVH by Blender)"
+            )
         names = read_npz(path, ())
         kind = kind_of(names)
+        if not kind and {"X", "joints"} <= names.keys():
+            raise InputError(
+                f"{path}: expected fps beside X (T, P, 3) in mm and joints, found none; add the frame rate"
+            )
         if kind == "MoCap":
             x, fps = load_mocap(path, LIMB_JOINTS, BODY_17)
             return x / 1000.0, np.arange(len(x)) / fps, "world"
@@ -149,21 +160,28 @@ def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]
     return in_body_order(truth.joints3d, truth.joints, LIMB_JOINTS), truth.stamp_ns * 1e-9, truth.frame
 
 
-def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -> MotionErrors:
+def compare(
+    motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str, offset_s: float | None = None
+) -> MotionErrors:
     """Errors of a motion against joints (T, P, 3) m, of BODY_15 or BODY_17, at increasing times (T,) s.
 
-    Only joints that both have are compared; the twelve limb joints are required.  Times are absolute where both ranges
-    overlap; otherwise both start at zero.  The truth is interpolated at the motion's times; frames outside its range,
-    or where it has gaps, are left out.
+    Only joints that both have are compared; the twelve limb joints are required.  The truth is interpolated at the
+    motion's times; frames outside its range, or where it has gaps, are left out.
+
+    offset_s : from the truth's first frame to the motion's; NaN = to be found by the poses; None = times are absolute
+        where both ranges overlap, else it is found, and where no offset is clear both start at zero
     """
     estimate = in_body_order(motion.joints3d, motion.joints, LIMB_JOINTS)
     truth = in_body_order(truth, BODY_17.joints[: truth.shape[1]], LIMB_JOINTS)
     known = np.isfinite(estimate).any(axis=(0, 2)) & np.isfinite(truth).any(axis=(0, 2))
     known[_LIMBS] = True
     at = motion.stamp_ns * 1e-9
-    if at[-1] < time_s[0] or at[0] > time_s[-1]:
-        logger.warning("the times of motion and truth do not overlap: both are compared from their first frame on")
+    apart = at[-1] < time_s[0] or at[0] > time_s[-1]
+    if apart or offset_s is not None:
         at, time_s = at - at[0], time_s - time_s[0]
+        at = at + (
+            _found_offset(estimate, at, truth, time_s, apart) if offset_s is None or np.isnan(offset_s) else offset_s
+        )
     usable = (at >= time_s[0] - 1e-6) & (at <= time_s[-1] + 1e-6) & np.isfinite(estimate[:, known]).all(axis=(1, 2))
     if not usable.any():
         raise InputError(
@@ -196,6 +214,17 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         world=in_world,
         toe_mm=1000.0 * metrics.toe_error(estimate, true),
     )
+
+
+def _found_offset(estimate: np.ndarray, at: np.ndarray, truth: np.ndarray, time_s: np.ndarray, apart: bool) -> float:
+    """Seconds from the truth's first frame to the motion's, by the poses; 0 where none is clear."""
+    reason = "the times of motion and truth do not overlap" if apart else "time offset"
+    found = find_offset(estimate, at, truth, time_s)
+    if found is None:
+        logger.warning("%s, and no offset is clear by the poses: both are compared from their first frame on", reason)
+        return 0.0
+    logger.warning("%s: by the poses the motion begins %.2f s after the truth (--time-offset S)", reason, found[0])
+    return found[0]
 
 
 def _at_times(values: np.ndarray, time_s: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -49,6 +49,11 @@ _TO_Z_UP = {
     "Y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "Z": np.eye(3),
 }
+#: Markers of Vicon's Plug-in Gait, which CMU and others use too, and of Helen Hayes; some of them are no chance.
+_MARKER = re.compile(
+    r"[LR]?\.?(FHD|BHD|ASIS?|PSIS?|THI|KNEE?|TIB|ANK(LE)?|HEEL?|TOE|SHO|UPA|ELB|FRM|FRA|WRA|WRB|FIN)|C7|T10|CLAV|STRN|SACR"
+)
+_FEWEST_MARKERS = 5
 _LIMBS = indices(BODY_17.joints, LIMB_JOINTS)
 #: Bounds against damaged files.
 _MAX_POINTS, _MAX_BYTES = 2000, 1 << 29
@@ -104,6 +109,13 @@ def body_joints(names: list[str]) -> dict[str, int]:
 def _on_the_body(path: Path, points: _Points) -> tuple[np.ndarray, np.ndarray]:
     found = body_joints(points.names)
     if missing := [joint for joint in LIMB_JOINTS if joint not in found]:
+        bare = (re.sub(r".*[:|]", "", name).strip().upper() for name in points.names)
+        markers = [name for name in bare if _MARKER.fullmatch(name)]
+        if len(markers) >= _FEWEST_MARKERS:
+            raise InputError(
+                f"expected joint centres, found markers on the skin ({', '.join(markers[:6])} ...); export the joint"
+                " centres of the model too, as LHJC or LKJC, or a BVH of the fitted skeleton"
+            )
         there = ", ".join(re.sub(r"[^ -~]", "?", name)[:30] for name in points.names[:20]) or "none"
         raise InputError(f"expected joints by names, found no {', '.join(missing)} among {there}; rename the joints")
     x = in_body_order(points.positions[:, list(found.values())].astype(np.float64), list(found), LIMB_JOINTS)
@@ -296,7 +308,7 @@ _READERS: tuple[tuple[re.Pattern[bytes], Callable[[Path], _Points]], ...] = (
 def load_mocap(
     path: Path, required: tuple[str, ...] = BODY_15.joints, joints: JointSet = BODY_15
 ) -> tuple[np.ndarray, float]:
-    """Joints (T, P, 3) mm, world z up, and frames per second of one MoCap ``.npz``.
+    """Joints (T, P, 3) mm, world z up, and frames per second of one MoCap ``.npz``, C3D, TRC or BVH.
 
     Toes are further joints of ``X``, or the array ``toes`` (T, 2, 3) with their names in ``toe_joints``.  Where
     ``toe_kind`` is "ball", the array holds the balls of the feet, which are no joints of the body.
@@ -304,6 +316,8 @@ def load_mocap(
     required : joints that the file must hold; others that it lacks are NaN
     joints : ``BODY_15`` or ``BODY_17``, those of the result
     """
+    if path.suffix.lower() != ".npz" and path.is_file() and (found := read_truth_file(path)) is not None:
+        return 1000.0 * found[0][:, : len(joints)], 1.0 / float(np.median(np.diff(found[1])))
     a = read_npz(path, ("X", "fps", "joints"))
     try:
         x, names = _named_joints(a)

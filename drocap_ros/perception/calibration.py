@@ -16,7 +16,8 @@ from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.tracks import Tracks, check_camera_matrix
 
 #: Names of lens distortions that ``sensor_msgs/CameraInfo`` knows (``distortion_models.hpp`` of sensor_msgs).
-_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+LENS_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+LENS_COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of them
 
 
 @dataclass(frozen=True)
@@ -107,11 +108,13 @@ def load_calibration(path: Path) -> CameraModel:
             f"{path}: expected image_width, image_height, camera_matrix as camera_calibration or OpenCV write them, or"
             f" a camera of Pose2Sim's TOML; found a problem with {first_line(error)}"
         ) from None
-    if lens not in _MODELS:
-        raise InputError(f"{path}: distortion_model: expected one of {', '.join(_MODELS)}, found {lens!r}; correct it")
+    if lens not in LENS_MODELS:
+        raise InputError(
+            f"{path}: distortion_model: expected one of {', '.join(LENS_MODELS)}, found {lens!r}; correct it"
+        )
     if min(model.width, model.height) < 1:
         raise InputError(f"{path}: expected a positive image size, found {model.width}x{model.height}; correct it")
-    if not np.isfinite(distortion).all() or len(distortion) not in (0, 4, 5, 8, 12, 14):
+    if not np.isfinite(distortion).all() or len(distortion) not in (0, *LENS_COEFFICIENTS):
         raise InputError(f"{path}: expected 4, 5, 8, 12 or 14 finite distortion coefficients, found {distortion}")
     try:
         check_camera_matrix(matrix, (model.width, model.height))
@@ -149,6 +152,11 @@ def with_lens_of(tracks: Tracks, config: ImageIngestConfig) -> Tracks:
     """Tracks whose lens nothing told, with the configured one; its distortion is taken off keypoints and points."""
     if tracks.camera_matrix is not None or (camera := camera_model(config, tracks.image_size)) is None:
         return tracks
+    return through_lens(tracks, camera)
+
+
+def through_lens(tracks: Tracks, camera: CameraModel) -> Tracks:
+    """Tracks with a lens, whose distortion is taken off keypoints and points."""
     background = tracks.background
     if camera.distortion.any():
         flat = camera.undistorted(tracks.keypoints.reshape(-1, 2)).reshape(tracks.keypoints.shape)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.keypoints.files import joint_name
+from drocap_ros.recording.keypoints.orders import joint_name
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.stamps import as_stamps
 from drocap_ros.tracks import Tracks, read_npz

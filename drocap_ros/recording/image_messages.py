@@ -14,7 +14,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.image_files import colour_rank, decoded, raw_to_bgr
 from drocap_ros.perception.sources.video import codec_of, decoded_packets
 from drocap_ros.recording.session import IMAGES, Message, Session, TopicInfo, header_stamp_ns
-from drocap_ros.stamps import JUMP_S, NS, StampValidator
+from drocap_ros.stamps import CONFIRMED_AFTER, NS
 
 if TYPE_CHECKING:
     from drocap_ros.perception.sources.base import Frame
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 _NO_PICTURE = re.compile(r"depth|disparity|mask|label|segment|confidence", re.IGNORECASE)
 #: Rank of a topic of distances or labels, behind colour (0) and grey (1).
 _DEPTH_RANK = 2
-#: Messages by which a clock that stands still is known.
-_FIRST = 32
+#: Least step of stamps against the recorder's times that is one of the clock, and no jitter.
+_STEP_NS = NS
 
 
 def image_from_message(message: Message, compressed: bool | None = None) -> np.ndarray:
@@ -48,8 +48,12 @@ def choose_images(session: Session, wanted: str = "") -> TopicInfo:
             if topic.name.strip("/") == wanted.strip("/"):
                 return topic
         raise InputError(f"--topic {wanted}: expected a topic with images, found {names or 'none'}; correct the name")
+    if not found:
+        there = ", ".join(f"{t.name} ({t.type_name})" for t in session.info.topics if t.count)
+        there = there or ("no messages" if session.info.topics else "no topics")
+        raise InputError(f"{session.path}: expected a topic with images, found {there}; record one")
     if len(found) < 2:
-        return session.choose_topic(*IMAGES)
+        return found[0]
     by_rank: dict[int, list[TopicInfo]] = {}
     for topic in found:
         by_rank.setdefault(_rank(session, topic), []).append(topic)
@@ -117,21 +121,53 @@ def _images(session: Session, chosen: TopicInfo, problems: Counter[str]) -> Iter
 
 
 def _stamped(session: Session, topic: str, problems: Counter[str]) -> Iterator[tuple[int, Message]]:
-    """Messages with their stamps, or with the recorder's times where the stamps do not advance."""
-    heads = [header_stamp_ns(m) for _, m in itertools.islice(session.messages((topic,)), _FIRST)]
-    by_recorder = sum(b > a for a, b in itertools.pairwise(heads)) < (len(heads) - 1) / 2
+    """Messages with their stamps by one clock, or with the recorder's times where the stamps do not advance."""
+    times = [(header_stamp_ns(message), raw.log_time_ns) for raw, message in session.messages((topic,))]
+    by_recorder = sum(b > a for (a, _), (b, _) in itertools.pairwise(times)) < (len(times) - 1) / 2
     if by_recorder:
         session.warn(f"the stamps on {topic} do not advance: the recorder's times are used, late by the transport")
-    stamps, begun, middle_ns = StampValidator(), False, sorted(heads)[len(heads) // 2] if heads else 0
-    for raw, message in session.messages((topic,)):
-        stamp_ns = raw.log_time_ns if by_recorder else header_stamp_ns(message)
-        begun = begun or by_recorder or abs(stamp_ns - middle_ns) < JUMP_S * NS
-        if not begun:
-            problems["stamp: expected a time near the next ones, got one from before the clock was set"] += 1
-            continue
-        try:
-            stamps.check(*divmod(stamp_ns, 10**9))
-        except InputError as error:
-            problems[str(error)] += 1
-            continue
-        yield stamp_ns, message
+    stamps = [log_ns for _, log_ns in times] if by_recorder else _of_one_clock(session, topic, times)
+    for (_, message), stamp_ns in zip(session.messages((topic,)), stamps, strict=False):
+        if stamp_ns is not None and stamp_ns >= 0:
+            yield stamp_ns, message
+        else:
+            problems["stamp: expected a time of the others' clock, got one from before it was set, or a stray one"] += 1
+
+
+def _of_one_clock(session: Session, topic: str, times: list[tuple[int, int]]) -> list[int | None]:
+    """Stamps by the clock of most messages, None for stray ones.
+
+    A clock that is set during the recording makes a step of the stamps that the recorder's times do not have: what
+    comes before and behind it is joined by these.
+
+    times : stamp and recorder's time of each message, ns
+    """
+    clocks: list[list[int]] = []  # numbers of the messages of each
+    before: tuple[list[int], int, int] | None = None
+    for i, (stamp_ns, log_ns) in enumerate(times):
+        step_ns, passed_ns = (0, 0) if before is None else (stamp_ns - before[1], log_ns - before[2])
+        if before is None or (abs(step_ns - passed_ns) > _STEP_NS and not 0 < step_ns < _STEP_NS):
+            own = [c for c in clocks if abs(stamp_ns - log_ns - times[c[-1]][0] + times[c[-1]][1]) < _STEP_NS]
+            clock = own[0] if own else []
+            clocks += [] if own else [clock]
+        else:
+            clock = before[0]
+        clock.append(i)
+        before = clock, stamp_ns, log_ns
+    stamps: list[int | None] = [None] * len(times)
+    main = max(clocks, key=len, default=[])
+    offsets = [_offset_ns(times, clock) for clock in clocks]
+    for clock, offset_ns in zip(clocks, offsets, strict=True):
+        if clock is main or len(clock) >= CONFIRMED_AFTER:
+            step_ns = 0 if clock is main else _offset_ns(times, main) - offset_ns
+            for i in clock:
+                stamps[i] = times[i][0] + step_ns
+            if step_ns:
+                session.warn(f"the clock of {topic} was set during the recording, by {-step_ns * 1e-9:+.1f} s: its"
+                             f" {len(clock)} images are joined to the others by the recorder's times")  # fmt: skip
+    return stamps
+
+
+def _offset_ns(times: list[tuple[int, int]], clock: list[int]) -> int:
+    """Median of a clock's stamps less the recorder's times."""
+    return sorted(times[i][0] - times[i][1] for i in clock)[len(clock) // 2]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+import re
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.file_kind import RECORDINGS, FileKind, file_kind
+from drocap_ros.file_kind import RECORDINGS, FileKind, file_kind, unpacking
 from drocap_ros.recording.mcap.metadata import METADATA_FILE, custom_metadata, read_metadata, storage_files, types_of
 from drocap_ros.recording.session import FORMS, Message, RawMessage, Session, SessionInfo
 
@@ -87,7 +88,7 @@ class McapSession(Session):
         for file in files:
             with file.open("rb") as opened:
                 if opened.read(len(MAGIC)) != MAGIC:
-                    raise InputError(f"{file}: expected an MCAP file, found other content at its start; check the path")
+                    raise InputError(f"{file}: expected an MCAP file, found other content at its start; check the file")
 
     def raw_messages(self, topics: Collection[str] = ()) -> Iterator[RawMessage]:
         """Messages of some topics (default: all) in the order of the files."""
@@ -159,9 +160,9 @@ class RosbagsSession(Session):
         from rosbags.highlevel import AnyReader
 
         try:
-            # A folder without metadata.yaml is read by its files.
-            there = sorted(path.glob("*.db3")) or sorted(path.glob("*.bag"))
-            files = [path] if path.is_file() or (path / METADATA_FILE).is_file() else there
+            # The files alone say what is in them: the description may be missing, or have been edited.
+            there = sorted(path.glob("[!.]*.db3")) or sorted(path.glob("[!.]*.bag"))
+            files = there if path.is_dir() and there else [path]
             self._reader = AnyReader(files, default_typestore=standard_types())
             self._reader.open()
         except Exception as error:  # noqa: BLE001  # rosbags passes on any error of its storages
@@ -301,7 +302,7 @@ def is_recording(path: str | Path) -> bool:
     """Whether :func:`open_session` may read a path: by its first bytes, its name, or the names in a folder."""
     path = Path(path)
     if path.is_dir():
-        return (path / METADATA_FILE).is_file() or any(p.suffix in (*_SUFFIXES, _PACKED) for p in path.iterdir())
+        return (path / METADATA_FILE).is_file() or any(p.suffix in (*_SUFFIXES, _PACKED) for p in path.glob("[!.]*"))
     return path.suffix in _SUFFIXES or (path.is_file() and file_kind(path) in RECORDINGS)
 
 
@@ -313,14 +314,25 @@ def open_session(path: str | Path) -> Session:
     if not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: expected {FORMS}, found a pipe or device; name a file or folder")
     if not is_recording(path):
-        raise InputError(f"{path}: expected {FORMS}, found something else; check the path")
+        found = "a folder without one" if path.is_dir() else file_kind(path).value
+        raise InputError(f"{path}: expected {FORMS}, found {found}{unpacking(path)}")
     try:
         if path.is_dir():
             return _open_folder(path)
         is_mcap = path.suffix == ".mcap" or file_kind(path) is FileKind.MCAP
-        return McapSession(path, [path], {}) if is_mcap else _open_bag(path)
+        session = McapSession(path, [path], {}) if is_mcap else _open_bag(path)
+        if parts := _other_parts(path):
+            session.warn(f"{path.name} is one of {len(parts) + 1} parts; name the folder {path.parent} for all")
+        return session
     except OSError as error:
         raise InputError(f"{path}: expected a readable recording; {error.strerror or error}") from None
+
+
+def _other_parts(path: Path) -> list[Path]:
+    """Files of a folder whose names differ from that of a part by its last number alone."""
+    stem, _, number = path.stem.rpartition("_")
+    others = path.parent.glob(f"[!.]*{path.suffix}") if number.isdigit() else ()
+    return [p for p in others if p != path and re.fullmatch(re.escape(stem) + r"_\d+", p.stem)]
 
 
 def session_info(path: str | Path) -> SessionInfo:
@@ -343,7 +355,7 @@ def _open_folder(path: Path) -> Session:
     storage = description.get("storage_identifier", "")
     packed = str(description.get("compression_mode", "")).lower() not in ("", "none")
     files = storage_files(path, description)
-    if not description and not any(p.suffix in _SUFFIXES for p in path.iterdir()):
+    if not description and not any(p.suffix in _SUFFIXES for p in path.glob("[!.]*")):
         raise InputError(f"{path}: expected a usable {METADATA_FILE} of compressed files, found none; unpack: zstd -d")
     session: Session
     if files and storage in ("mcap", "") and not packed and all(f.suffix == ".mcap" for f in files):

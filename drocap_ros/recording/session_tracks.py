@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections import Counter
 from collections.abc import Iterable
 
@@ -10,16 +11,19 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import unit_quaternions
-from drocap_ros.perception.calibration import CameraModel
+from drocap_ros.perception.calibration import LENS_COEFFICIENTS, LENS_MODELS, CameraModel, through_lens
 from drocap_ros.recording import session as recorded
+from drocap_ros.recording.other_poses import read_other_poses
 from drocap_ros.recording.pose_messages import float_array, read_fixed_points
 from drocap_ros.recording.session import Message, Session, TopicInfo, calibration_of, header_stamp_ns, xyzw_of
 from drocap_ros.recording.telemetry.log import VehicleTrack, with_camera
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
-#: Where other systems record the poses of a vehicle or camera.
-_OTHER_POSES = ("tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
+#: Where other systems record poses that are not read: of trees of frames.
+_OTHER_POSES = ("tf2_msgs/msg/TFMessage",)
+#: Topics of images without distortion.
+_RECTIFIED = re.compile(r"rect", re.IGNORECASE)
 #: Calibrations that differ by a smaller share are one: the scale of the motion errs by as much.
 _SAME_LENS = 0.01
 #: A stamp farther from most others, in ns, is of another clock: a day, the longest flight and more.
@@ -78,10 +82,13 @@ def with_recorded_camera(
     session: Session, tracks: Tracks, near: str, mount_pitch_deg: float | None = None, *, telemetry: bool = True
 ) -> Tracks:
     """Tracks with the camera's matrix and poses where the recording holds them, those nearest to a topic's name."""
-    tracks = dataclasses.replace(tracks, camera_matrix=_camera_matrix(session, near, tracks.image_size))
+    camera = _recorded_lens(session, near, tracks.image_size)
+    tracks = dataclasses.replace(tracks, camera_matrix=None) if camera is None else through_lens(tracks, camera)
     if not telemetry:
         return tracks
     vehicle = read_vehicle_track(session, near)
+    if vehicle is None:
+        vehicle = read_other_poses(session)
     if vehicle is None:
         if others := ", ".join(topic.name for topic in session.topics_of(*_OTHER_POSES)):
             session.warn(f"no camera telemetry: {others} is not read, {recorded.VEHICLE_STATE} is; add it to the bag")
@@ -156,38 +163,67 @@ def _tracks_of(stamp_ns: np.ndarray, messages: list[Message], track_id: int) -> 
     return Tracks(keypoints, joints.joints, stamp_ns, size, confidence, covariance, real_lens=True)
 
 
-def _camera_matrix(session: Session, near: str, size: tuple[int, int]) -> np.ndarray | None:
-    """(3, 3) px of the first usable camera info, for images of ``size`` (width, height) px; or None."""
+def _recorded_lens(session: Session, near: str, size: tuple[int, int]) -> CameraModel | None:
+    """The lens of the first usable camera info, for images of ``size`` (width, height) px; or None."""
     info = _nearest(session.topics_of(recorded.CAMERA_INFO), near)
     if info is None:
         return None
-    camera = _first_calibration(session, info.name, size)
+    camera = _first_calibration(session, info.name, size, rectified=bool(_RECTIFIED.search(near.rpartition("/")[2])))
     if camera is None:
         session.warn(f"no usable calibration on {info.name}: its matrix is not set")
         return None
     if (camera.width, camera.height) == size:
-        return camera.matrix
+        return camera
     found = f"the calibration on {info.name} is for {camera.width}x{camera.height} px, the images have"
     if not camera.has_aspect_of(size):
         session.warn(f"{found} {size[0]}x{size[1]}: not used; record the calibration of this camera mode")
         return None
     session.warn(f"{found} {size[0]}x{size[1]}: taken as the same picture, resized")
-    return camera.resized(*size).matrix
+    return camera.resized(*size)
 
 
-def _first_calibration(session: Session, topic: str, size: tuple[int, int]) -> CameraModel | None:
-    """The first usable calibration, of images of ``size`` where it states none; warns where it changes."""
+def _first_calibration(session: Session, topic: str, size: tuple[int, int], *, rectified: bool) -> CameraModel | None:
+    """The first usable calibration, of images of ``size`` where it states none; warns where it changes.
+
+    rectified : of images without distortion: their matrix is P
+    """
     camera: CameraModel | None = None
     for _, message in session.messages((topic,)):
         matrix = calibration_of(message)
+        if rectified and (projection := np.asarray(_either(message, "p", ()), np.float64)).size == 12:
+            matrix = projection.reshape(3, 4)[:, :3] if projection.any() else matrix
         if matrix is None or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
             continue
         if camera is None:
             camera = CameraModel(message.width or size[0], message.height or size[1], matrix)
-        elif not np.allclose(matrix, camera.matrix, rtol=_SAME_LENS):
+            if not rectified:
+                camera = _distorted(session, topic, camera, message)
+            part = message.roi
+            if (part.width, part.height) == size != (camera.width, camera.height):
+                moved = camera.matrix - [[0, 0, part.x_offset], [0, 0, part.y_offset], [0, 0, 0]]
+                camera = dataclasses.replace(camera, width=part.width, height=part.height, matrix=moved)
+            first = matrix
+        elif not np.allclose(matrix, first, rtol=_SAME_LENS):
             session.warn(f"the calibration on {topic} changes: the first one is used; cut the recording there")
             break
     return camera
+
+
+def _distorted(session: Session, topic: str, camera: CameraModel, message: Message) -> CameraModel:
+    """The lens with the distortion that a message states."""
+    found, model = np.asarray(_either(message, "d", ()), np.float64), str(message.distortion_model)
+    if not found.any():
+        return camera
+    if model not in LENS_MODELS or found.size not in LENS_COEFFICIENTS or not np.isfinite(found).all():
+        session.warn(f"the distortion on {topic} ({model[:40]!r}, {found.size} values) is of no known form: not used")
+        return camera
+    session.warn(f"the distortion of the lens on {topic} is taken off the keypoints")
+    return dataclasses.replace(camera, distortion=found, distortion_model=model)
+
+
+def _either(message: Message, name: str, otherwise: object) -> object:
+    """A field by the name of ROS 2, or of ROS 1, in capitals."""
+    return getattr(message, name, getattr(message, name.upper(), otherwise))
 
 
 def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:

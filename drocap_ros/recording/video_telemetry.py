@@ -29,7 +29,7 @@ from drocap_ros.perception.calibration import camera_model
 from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.recording.open_session import is_recording
 from drocap_ros.recording.telemetry import srt
-from drocap_ros.recording.telemetry.log import TelemetryLog, VehicleTrack, camera_attitude, with_camera
+from drocap_ros.recording.telemetry.log import Lack, TelemetryLog, VehicleTrack, camera_attitude, with_camera
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.video_tracks import stated_times
 from drocap_ros.tracks import Tracks
@@ -72,14 +72,18 @@ class TimeOffset(NamedTuple):
     """Seconds from the log's first state to the video's first image, and their source.
 
     correlation : of the camera's turning with the image's motion; NaN for other sources
+    zone_h : of the camera's clock, where it is that of a time zone
     """
 
     seconds: float
     source: OffsetSource
     correlation: float = math.nan
+    zone_h: float = 0.0
 
     def __str__(self) -> str:
         found = "" if math.isnan(self.correlation) else f" (correlation {self.correlation:.2f})"
+        if self.zone_h:
+            found += f"; the creation time is taken as local time, {self.zone_h:+g} h from UTC"
         return f"time offset {self.seconds:.2f} s, {self.source.value}{found}"
 
 
@@ -95,17 +99,17 @@ def find_offset(
         return TimeOffset(given_s, OffsetSource.GIVEN)
     if log.video_clock:
         return TimeOffset(0.0 - float(log.track.stamp_ns[0]) * 1e-9, OffsetSource.VIDEO_CLOCK)
-    created_s = _offset_by_creation(video, log)
+    created_s, zone_h = _offset_by_creation(video, log)
     part_s = _offset_by_part(video, log, created_s)
     moved = image_motion(video, progress)
     found = correlate_turning(log.track, *moved, mount_pitch_deg, near_s=created_s if part_s is None else part_s)
     if found is not None:
         seconds, correlation = found
-        return TimeOffset(seconds, OffsetSource.CORRELATION, correlation)
+        return TimeOffset(seconds, OffsetSource.CORRELATION, correlation, zone_h if part_s is None else 0.0)
     if part_s is not None:
         return TimeOffset(part_s, OffsetSource.RECORDED_PART)
     if created_s is not None:
-        return TimeOffset(created_s, OffsetSource.CREATION_TIME)
+        return TimeOffset(created_s, OffsetSource.CREATION_TIME, zone_h=zone_h)
     raise InputError(
         f"{video}: expected a time offset between the video and the log, found no way to estimate it (the camera turned"
         " too evenly or too little, or the log does not cover the video; no usable creation time); give"
@@ -113,13 +117,23 @@ def find_offset(
     )
 
 
-def _offset_by_creation(video: Path, log: TelemetryLog) -> float | None:
-    created_ns, _ = stated_times(video)
+def _offset_by_creation(video: Path, log: TelemetryLog) -> tuple[float | None, float]:
+    """Seconds from the log's first state to the creation time, None outside the log, and its hours from UTC.
+
+    Cameras and phones write their local time in the place of UTC: whole and half hours are tried where UTC does not
+    fit, and one is taken where no other fits.
+    """
+    created_ns, length_s = stated_times(video)
     if created_ns is None or log.utc_minus_stamp_ns is None:
-        return None
+        return None, 0.0
     seconds = (created_ns - log.utc_minus_stamp_ns - int(log.track.stamp_ns[0])) * 1e-9
-    # A camera clock in local time, or never set, gives a time far outside the flight.
-    return seconds if -CREATION_SLACK_S <= seconds <= log.duration_s else None
+    latest_s = log.duration_s - (length_s or 0.0) + CREATION_SLACK_S
+    fits = [half / 2 for half in range(-24, 29) if -CREATION_SLACK_S <= seconds - 1800 * half <= latest_s]
+    if -CREATION_SLACK_S <= seconds <= log.duration_s:
+        fits = [0.0]
+    elif len(fits) > 1:
+        fits = [hours for hours in fits if hours.is_integer()]
+    return (seconds - 3600 * fits[0], fits[0]) if len(fits) == 1 else (None, 0.0)
 
 
 def _offset_by_part(video: Path, log: TelemetryLog, created_s: float | None) -> float | None:
@@ -355,6 +369,8 @@ def with_telemetry(
     if reason:
         logger.warning("%s: camera telemetry incomplete: %s", name, reason)
     sources = {"file": name.name, "kind": log.kind, "time_offset": str(offset)}
+    if zoom := [str(lack) for lack in log.lacks if lack.kind is Lack.ZOOM]:
+        sources["zoom"] = zoom[0]
     camera = camera_model(ingest, tracks.image_size)
     if camera is None and log.lens is not None and tracks.camera_rotation is not None:
         fov_deg = log.lens.horizontal_fov_deg(tracks.image_size)

@@ -11,6 +11,7 @@ import numpy as np
 from drocap_ros.contacts import MOTION_REST_M_S
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
+from drocap_ros.recording.keypoints.body_check import is_no_body
 from drocap_ros.report.statistics import Statistics, mean_known
 from drocap_ros.skeleton import TOES
 
@@ -101,6 +102,11 @@ class MotionCheck(Enum):
         "Half of the joints project more than {px:.1f} px from their keypoints, {share:.1%} of the body's size in the"
         " image. The 2D keypoints are noisy, or the motion does not explain them.",
     )
+    NO_BODY = (
+        "Keypoints of no body",
+        "By their places in the image the keypoints are not those of a person with these names: joints are exchanged,"
+        " of another order, or upside down. Check the names; `drocap reconstruct --order NAME` replaces them.",
+    )
     OUTLIERS = (
         "Outlying keypoints",
         "{share:.1%} of the keypoints lie more than {limit:.0%} of the body's size from the projected joints. They"
@@ -140,6 +146,7 @@ class MotionCheck(Enum):
         " path is not known. The player stands it on its lowest joint.",
     )
     ASSUMED_SCALE = ("Scale assumed", "Metres come from {source}{height}, not from a measurement.")
+    ZOOM = ("Lens changes", "{words}. Nothing checks the telemetry then; use a clip of one focal length.")
     TELEMETRY_REJECTED = ("Telemetry not used", "{words} The motion stays in the axes of the camera.")
     TELEMETRY_JUMPS = ("Reported position jumps", "{words}")
     CALIBRATION = ("Camera measured", "{words}")
@@ -167,7 +174,13 @@ class Finding:
 
 
 #: Checks that alone make a motion doubtful.
-_DOUBTFUL = (MotionCheck.MIRRORED, MotionCheck.MISFIT, MotionCheck.HIGH_ERROR, MotionCheck.SLIDING_FEET)
+_DOUBTFUL = (
+    MotionCheck.NO_BODY,
+    MotionCheck.MIRRORED,
+    MotionCheck.MISFIT,
+    MotionCheck.HIGH_ERROR,
+    MotionCheck.SLIDING_FEET,
+)
 
 
 def run_checks(motion: Motion, s: Statistics) -> list[Finding]:
@@ -230,6 +243,8 @@ def _of_view(motion: Motion, s: Statistics) -> Iterator[Finding]:
 
 
 def _of_keypoints(motion: Motion, s: Statistics) -> Iterator[Finding]:
+    if is_no_body(motion.keypoints, motion.joints):
+        yield _warn(MotionCheck.NO_BODY)
     # The median: a few gross outliers in 2D, which the method ignores, are no reason to doubt the rest.
     if (share := s.median_px / s.body_px) > _HIGH_ERROR:
         yield _warn(MotionCheck.HIGH_ERROR, px=s.median_px, share=share)
@@ -271,6 +286,8 @@ def _of_frame(motion: Motion) -> Iterator[Finding]:
         height = motion.meta.get("assumed_height_m")
         assumed = f" of {height:.2f} m" if isinstance(height, int | float) else ""
         yield _note(MotionCheck.ASSUMED_SCALE, source=motion.scale_source.replace("_", " "), height=assumed)
+    if isinstance(source := motion.meta.get("telemetry"), dict) and "zoom" in source:
+        yield _warn(MotionCheck.ZOOM, words=str(source["zoom"]).capitalize())
     if words := telemetry_words(motion.meta):
         if "telemetry_rejected" in motion.meta:
             yield _warn(MotionCheck.TELEMETRY_REJECTED, words=words)

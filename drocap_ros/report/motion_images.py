@@ -23,7 +23,7 @@ from drocap_ros.perception.models.network_input import shrink
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.sources.base import prefetch
 from drocap_ros.recording.open_session import is_recording, open_session
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
+from drocap_ros.recording.session import IMAGES
 from drocap_ros.tracks import Tracks
 
 #: x_min, y_min, x_max, y_max px.
@@ -183,7 +183,7 @@ def has_images(path: Path) -> bool:
     if not is_recording(path):
         return True
     with open_session(path) as session:
-        return bool(session.topics_of(IMAGE, COMPRESSED_IMAGE))
+        return bool(session.topics_of(*IMAGES))
 
 
 def read_motion_images(path: Path, motion: Shown, progress: Progress | None = None) -> MotionImages:
@@ -231,7 +231,8 @@ def _opened(path: Path, motion: Shown) -> Iterator[Images]:
     """Images of a path; refused when they cannot be those of the motion."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
-    topic = str(_stated(motion, "images").get("topic", "")) if is_recording(path) else ""
+    topic = str(_stated(motion, "images").get("topic", ""))
+    topic = topic if is_recording(path) or path.name == motion.meta.get("input") else ""
     with open_images(path, topic=topic) as images:
         if not is_recording(path):  # a recording may hold more images than poses, with the same clock
             _check_times(path, images, motion)

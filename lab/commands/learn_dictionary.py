@@ -71,7 +71,7 @@ def learn_from_folder(args: argparse.Namespace) -> Dictionary:
     files = mocap_files(args.folder, args.include)
     poses, frames, stated = [], 0, []
     for path in files:
-        take, arrays = load_mocap(path)[0], read_npz(path, ())
+        take, arrays = load_mocap(path)[0], read_npz(path, ()) if path.suffix == ".npz" else {}
         poses.append(normalize_poses(take[:: args.every]))
         frames += len(take)
         stated.append({name: str(arrays[name]) for name in ("licence", "source") if name in arrays})

@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.evaluation.compare import TRUTH_SUFFIXES
 from drocap_ros.evaluation.truth_files import load_mocap
 from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
@@ -63,7 +64,8 @@ def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of MoCap .npz files; no such folder")
-    files = sorted(path for path in folder.glob("*.npz") if fnmatchcase(path.stem, include))
+    found = (path for path in folder.glob("[!.]*") if path.suffix.lower() in TRUTH_SUFFIXES)
+    files = sorted(path for path in found if fnmatchcase(path.stem, include))
     if not files:
         raise InputError(f"{folder}: expected MoCap files {include}.npz, found none; check the folder and the pattern")
     return files

@@ -177,6 +177,33 @@ def test_markers_of_other_places_are_named(tmp_path, world):
         load_truth(path)
 
 
+@pytest.mark.parametrize("prefix", ["", "Subject1:", "jim_"])
+def test_a_file_of_skin_markers_alone_is_refused_in_words(tmp_path, world, prefix):
+    names = ["LASI", "RASI", "LKNE", "RKNE", "LANK", "RANK", "LTOE", "RTOE", "C7", "LSHO", "RSHO", "LELB", "RELB"]
+    path = trc(tmp_path / "truth.trc", [prefix.replace("_", "|") + name for name in names], world.joints3d[:, :13])
+    with pytest.raises(InputError, match="expected joint centres, found markers on the skin"):
+        load_truth(path)
+
+
+@pytest.mark.parametrize("name", ["truth.fbx", "truth.csv", "truth.mp4", "truth"])
+def test_a_truth_of_another_kind_names_those_that_are_read(tmp_path, name):
+    (tmp_path / name).write_bytes(b"Kaydara FBX Binary  \x00\x1a\x00")
+    with pytest.raises(InputError, match="expected a truth as MoCap"):
+        load_truth(tmp_path / name)
+
+
+@pytest.mark.parametrize("form", ["c3d", "trc", "bvh"])
+def test_mocap_is_read_in_every_form_of_a_truth(tmp_path, world, form):
+    from lab.studies.protocol import mocap_files
+
+    export(world, tmp_path / f"take.{form}")
+    (path,) = mocap_files(tmp_path, "take")
+    x, fps = load_mocap(path, joints=BODY_17)
+    truth, time_s, _ = load_truth(path)
+    assert np.allclose(x / 1000, truth, equal_nan=True)
+    assert fps == pytest.approx(1 / np.median(np.diff(time_s)))
+
+
 @pytest.mark.parametrize("form", ["c3d", "trc", "bvh"])
 def test_damaged_files_give_a_truth_or_one_line(tmp_path, world, form):
     export(world, tmp_path / f"truth.{form}")

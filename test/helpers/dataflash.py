@@ -24,6 +24,28 @@ def packed(name, *values):
     return HEAD + bytes([number]) + struct.pack(codes, *values)
 
 
+def write_dataflash_text(path, t, angles, geodetic, mounts, settings=()):
+    """The same as text: degrees with their decimals, several mounts, and GPS in the place of POS."""
+    columns = {"GPS": "TimeUS,Status,GMS,GWk,Lat,Lng,Alt", "ATT": "TimeUS,Roll,Pitch,Yaw",
+               "MNT": "TimeUS,I,Roll,Pitch,YawB,YawE", "PARM": "TimeUS,Name,Value"}  # fmt: skip
+    forms = {"GPS": "QBIHLLf", "ATT": "Qfff", "MNT": "QBffff", "PARM": "QNf"}
+    lines = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
+    lines += [f"FMT, {150 + i}, 50, {name}, {forms[name]}, {of}" for i, (name, of) in enumerate(columns.items())]
+    lines += [f"PARM, 1, {name}, {value}" for name, value in settings]
+    for i, s in enumerate(t):
+        us, place = round((10 + s) * 1e6), geodetic[i]
+        week, rest = divmod(START_UTC_S + s - GPS_EPOCH_S + LEAP_S, 604_800)
+        lines.append(f"GPS, {us}, 3, {round(rest * 1000)}, {int(week)}, {place[0]:.7f}, {place[1]:.7f}, {place[2]:.3f}")
+        lines.append("ATT, {}, {:.5f}, {:.5f}, {:.5f}".format(us, *np.rad2deg(angles[i])))
+        nose = np.rad2deg(angles[i, 2])
+        for number, (mount, step) in enumerate(mounts):
+            if i % step == 0:
+                roll, pitch, yaw = np.rad2deg(mount[i])
+                lines.append(f"MNT, {us}, {number}, {roll:.5f}, {pitch:.5f}, {yaw - nose:.5f}, {yaw:.5f}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def write_dataflash(path, t, angles, geodetic=None, mount=None, mount_type=None):
     """Power-up 10 s before the first of times t (N,) s; angles roll pitch yaw rad; latitude, longitude, altitude."""
     out = []

@@ -96,3 +96,46 @@ def turning_video(path, start_s, seconds, even=False):
         writer.write(np.take(wall, np.arange(shift, shift + width) % wide, axis=1))
     writer.release()
     return path
+
+
+def with_track(video, samples, code=b"tx3g", handler=b"sbtl", step_ms=100):
+    """The video with a track of samples after its own tracks: 3GPP's timed text, unless it has another code."""
+
+    def box(name, *parts):
+        data = b"".join(parts)
+        return struct.pack(">I4s", 8 + len(data), name) + data
+
+    data, count = video.read_bytes(), len(samples)
+    table = box(
+        b"stbl",
+        box(b"stsd", struct.pack(">II", 0, 1), box(code, bytes(30))),
+        box(b"stts", struct.pack(">IIII", 0, 1, count, step_ms)),
+        box(b"stsc", struct.pack(">IIIII", 0, 1, 1, count, 1)),
+        box(b"stsz", struct.pack(">III", 0, 0, count), *(struct.pack(">I", len(s)) for s in samples)),
+        box(b"stco", struct.pack(">III", 0, 1, data.index(b"moov") - 4 + 8)),
+    )
+    media = box(b"mdia", box(b"mdhd", struct.pack(">IIIIIHH", 0, 0, 0, 1000, count * step_ms, 0, 0)),
+                box(b"hdlr", struct.pack(">II4s", 0, 0, handler), bytes(13)), box(b"minf", table))  # fmt: skip
+    at = data.index(b"moov") - 4
+    length = struct.unpack_from(">I", data, at)[0]
+    assert at + length == len(data)
+    track = box(b"trak", media)
+    # The samples stand before the index, as the track's table of places says: after all that was there before it.
+    return data[:at] + box(b"mdat", *samples) + struct.pack(">I", length + len(track)) + data[at + 4 :] + track
+
+
+def write_ulog(path, topics):
+    """PX4's log of topics: rows of (name, instance, format, struct codes, rows with their times us first)."""
+
+    def message(kind, content):
+        return struct.pack("<HB", len(content), ord(kind)) + content
+
+    out = [b"ULog\x01\x12\x35\x01", struct.pack("<Q", 0)]
+    out += [message("F", f"{name}:{form}".encode()) for name, form in {t[0]: t[2] for t in topics}.items()]
+    for number, (name, instance, *_) in enumerate(topics):
+        out.append(message("A", struct.pack("<BH", instance, number) + name.encode()))
+    data = [(row[0], number, struct.pack(codes, *row))
+            for number, (_, _, _, codes, rows) in enumerate(topics) for row in rows]  # fmt: skip
+    out += [message("D", struct.pack("<H", number) + row) for _, number, row in sorted(data)]
+    path.write_bytes(b"".join(out))
+    return path

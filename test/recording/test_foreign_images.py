@@ -251,3 +251,68 @@ def test_json_of_wrong_types_ends_in_one_line(tmp_path, capsys, message, kind):
     assert main(["track", str(tmp_path / "a.mcap"), *words]) == 2
     assert "Traceback" not in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("steps_s", [{12: -40.0}, {12: 3600.0}, {8: 5.0, 16: -70.0}, {6: -1.5}, {18: 86_400.0 * 400}])
+@pytest.mark.parametrize("latency", ["even", "late once", "paused"])
+def test_a_clock_that_is_set_costs_no_image(tmp_path, messages, steps_s, latency):
+    entries, off_s, time_ns = [], 0.0, START_NS
+    for i in range(24):
+        off_s += steps_s.get(i, 0.0)
+        time_ns += 30 * 10**9 if latency == "paused" and i == 10 else STEP_NS
+        late_ns = 3 * 10**9 - (i - 18) * STEP_NS if latency == "late once" and 18 <= i < 20 else 5_000_000
+        message = image_message(messages, random_image(i), time_ns + round(off_s * 1e9))
+        entries.append(("/camera", message, time_ns + late_ns, messages.cdr(message)))
+    expected = np.diff([START_NS + STEP_NS * i + (30 * 10**9 - STEP_NS) * (latency == "paused" and i >= 10)
+                        for i in range(24)])  # fmt: skip
+    record(tmp_path / "s", entries)
+    with open_session(tmp_path / "s") as session:
+        found = np.array([f.stamp_ns for f in read_images(session)])
+        assert np.abs(np.diff(found) - expected).max() < 10**7
+        assert sum("was set during the recording" in warning for warning in session.warnings) >= 1
+
+
+def test_files_of_a_mac_and_an_edited_description_change_nothing(tmp_path, messages):
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, folder = get_typestore(Stores.ROS2_JAZZY), tmp_path / "bag"
+    kind = store.types["sensor_msgs/msg/CompressedImage"]
+    stamp, header = (store.types[f"{name}"] for name in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header"))
+    with Writer(folder, version=9) as writer:
+        topic = writer.add_connection("/camera", kind.__msgtype__, typestore=store)
+        for i in range(12):
+            data = cv2.imencode(".jpg", random_image(i))[1].ravel()
+            message = kind(header(stamp(sec=100, nanosec=i * STEP_NS), "c"), "jpeg", data)
+            writer.write(topic, START_NS + i * STEP_NS, store.serialize_cdr(message, kind.__msgtype__))
+    (folder / "._bag.db3").write_bytes(bytes(100))
+    text = (folder / "metadata.yaml").read_text()
+    for before, after in (("''", "edited"), ("[]", "[{depth: 3}]")):
+        text = text.replace(f"offered_qos_profiles: {before}", f"offered_qos_profiles: {after}")
+    (folder / "metadata.yaml").write_text(text)
+    with open_session(folder) as session:
+        assert len(list(read_images(session))) == 12
+
+
+def test_one_part_of_a_recording_is_said_to_be_one(tmp_path, messages):
+    for i in range(3):
+        message = image_message(messages, random_image(i), START_NS + i * STEP_NS)
+        record(tmp_path / f"s{i}", [("/camera", message, START_NS, messages.cdr(message))])
+        next((tmp_path / f"s{i}").glob("*.mcap")).rename(tmp_path / f"walk_{i}.mcap")
+    with open_session(tmp_path / "walk_1.mcap") as session:
+        assert any("is one of 3 parts; name the folder" in warning for warning in session.warnings)
+
+
+@pytest.mark.parametrize(("suffix", "head", "command"), [
+    (".zstd", b"\x28\xb5\x2f\xfd", "zstd -d"), (".gz", b"\x1f\x8b\x08", "gunzip"), (".bz2", b"BZh9", "bunzip2"),
+    (".xz", b"\xfd7zXZ\x00", "unxz"), (".lz4", b"\x04\x22\x4d\x18", "unlz4"), (".7z", b"7z\xbc\xaf\x27\x1c", "7z x"),
+    (".zip", b"PK\x03\x04", "unzip"),
+])  # fmt: skip
+@pytest.mark.parametrize("name", ["a.db3", "a.mcap", "a.bag", "walk.mp4"])
+@pytest.mark.parametrize("command_of_ours", ["info", "track", "reconstruct"])
+def test_packed_files_are_refused_with_the_command_that_unpacks(tmp_path, capsys, suffix, head, command, name,
+                                                                command_of_ours):  # fmt: skip
+    path = tmp_path / f"{name}{suffix}"
+    path.write_bytes(head + bytes(200))
+    assert main([command_of_ours, str(path), *["--models", "simulation"] * (command_of_ours != "info")]) == 2
+    assert f"unpack it: {command} {path}" in capsys.readouterr().err

@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 
@@ -270,15 +271,120 @@ def test_change_of_the_calibration_is_reported(tmp_path, messages, capture):
     assert np.array_equal(tracks.camera_matrix, capture.tracks.camera_matrix)
 
 
-def test_poses_of_other_systems_are_said_not_to_be_read(tmp_path, messages, capture):
-    kind = "geometry_msgs/msg/PoseStamped"
+def test_trees_of_frames_are_said_not_to_be_read(tmp_path, messages, capture):
     entries = [e for e in flight_entries(messages, capture) if e[0] != "/drocap/vehicle/state"]
-    pose = messages(kind, header=messages.header(START_NS, "odom"))
-    record(tmp_path / "s", [*entries, ("/mavros/local_position/pose", pose, START_NS + 10**10, messages.cdr(pose))])
+    tree = messages("tf2_msgs/msg/TFMessage", transforms=[])
+    record(tmp_path / "s", [*entries, ("/tf", tree, START_NS + 10**10, messages.cdr(tree))])
     with open_session(tmp_path / "s") as session:
         assert read_pose2d(session).camera_position is None
         (warning,) = session.warnings
-    assert "/mavros/local_position/pose is not read, drocap_ros/msg/VehicleState is" in warning
+    assert "/tf is not read, drocap_ros/msg/VehicleState is" in warning
+
+
+def of_other_systems(messages, entries, forms):
+    """The entries with the vehicle's states as other systems write them."""
+    found = [e for e in entries if e[0] != "/drocap/vehicle/state"]
+    for _, state, log, _ in (e for e in entries if e[0] == "/drocap/vehicle/state"):
+        stamp = state.header.stamp
+        x, y, z = (float(v) for v in state.position_enu_m)
+        point = messages("geometry_msgs/msg/Point", x=x, y=y, z=z)
+        pose = messages("geometry_msgs/msg/Pose", position=point, orientation=state.orientation)
+        header = messages("std_msgs/msg/Header", stamp=stamp, frame_id="map")
+        held = messages("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+        alone = messages("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
+        fix = messages("sensor_msgs/msg/NavSatStatus", status=0, service=1)
+        east = x / 111_320.0 / np.cos(np.deg2rad(47))
+        other = messages("geometry_msgs/msg/Pose", position=messages("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0),
+                         orientation=state.orientation)  # fmt: skip
+        known = {
+            "odom": ("/mavros/local_position/odom", messages("nav_msgs/msg/Odometry", header=header, pose=held,
+                                                             child_frame_id="base_link")),
+            "pose": ("/mavros/local_position/pose", alone),
+            "goal": ("/mavros/setpoint_position/local",
+                     messages("geometry_msgs/msg/PoseStamped", header=header, pose=other)),
+            "imu": ("/mavros/imu/data", messages("sensor_msgs/msg/Imu", header=header, orientation=state.orientation)),
+            "gps": ("/mavros/global_position/global", messages(
+                "sensor_msgs/msg/NavSatFix", header=header, status=fix, latitude=47 + y / 111_320.0, longitude=8 + east,
+                altitude=400 + z)),
+        }  # fmt: skip
+        found += [(topic, message, log, messages.cdr(message)) for topic, message in (known[form] for form in forms)]
+    return sorted(found, key=lambda entry: entry[2])
+
+
+@pytest.mark.parametrize(("forms", "used"), [
+    (["odom"], "/mavros/local_position/odom"), (["pose"], "/mavros/local_position/pose"),
+    (["pose", "goal", "odom", "imu", "gps"], "/mavros/local_position/odom"), (["goal", "pose"], "local_position/pose"),
+    (["imu", "gps"], "/mavros/imu/data (sensor_msgs/msg/Imu) and /mavros/global_position/global"),
+])  # fmt: skip
+def test_poses_of_mavros_are_the_vehicles(tmp_path, messages, capture, forms, used):
+    entries = flight_entries(messages, capture, gimbal=False)
+    record(tmp_path / "own", entries)
+    record(tmp_path / "other", of_other_systems(messages, entries, forms))
+    found = []
+    for name in ("own", "other"):
+        with open_session(tmp_path / name) as session:
+            found.append(read_pose2d(session, -20.0))
+    assert any(used in warning for warning in session.warnings)
+    own, other = found
+    assert np.rad2deg(angle_between(own.camera_rotation, other.camera_rotation)).max() < 1e-4
+    moved = [t.camera_position - t.camera_position[0] for t in (own, other)]
+    assert np.abs(moved[0] - moved[1]).max() < (0.03 if "gps" in forms and len(forms) == 2 else 1e-6)
+
+
+@pytest.mark.parametrize("frame", ["camera_link", "camera_color_optical_frame"])
+def test_a_frame_of_a_camera_is_the_cameras(tmp_path, messages, capture, frame):
+    from drocap_ros.flight.vehicle import optical_orientation
+
+    entries = flight_entries(messages, capture)
+    record(tmp_path / "own", entries)
+    turned = []
+    for e in entries:
+        if e[0] == "/drocap/vehicle/state":
+            g = e[1].gimbal_orientation
+            xyzw = np.array([g.x, g.y, g.z, g.w])
+            xyzw = optical_orientation(xyzw) if "optical" in frame else xyzw
+            point = messages(
+                "geometry_msgs/msg/Point", **dict(zip("xyz", map(float, e[1].position_enu_m), strict=True))
+            )
+            pose = messages("geometry_msgs/msg/Pose", position=point, orientation=messages.quaternion(xyzw))
+            held = messages("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+            odom = messages("nav_msgs/msg/Odometry", header=e[1].header, pose=held, child_frame_id=frame)
+            turned.append(("/slam/odom", odom, e[2], messages.cdr(odom)))
+        else:
+            turned.append(e)
+    record(tmp_path / "other", turned)
+    found = []
+    for name in ("own", "other"):
+        with open_session(tmp_path / name) as session:
+            found.append(read_pose2d(session))
+    assert np.rad2deg(angle_between(found[0].camera_rotation, found[1].camera_rotation)).max() < 1e-4
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant"])
+@pytest.mark.parametrize("rectified", [False, True])
+def test_the_distortion_and_the_projection_of_a_camera_info_are_used(tmp_path, messages, capture, model, rectified):
+    from drocap_ros.perception.calibration import CameraModel
+    from drocap_ros.recording.session_tracks import with_recorded_camera
+
+    tracks = dataclasses.replace(capture.tracks, camera_matrix=None)
+    k, size = capture.tracks.camera_matrix, tracks.image_size
+    d = {"plumb_bob": [-0.2, 0.05, 1e-3, -1e-3, 0.0], "equidistant": [0.02, -0.01, 0.003, 0.0],
+         "rational_polynomial": [-0.2, 0.05, 1e-3, -1e-3, 0.0, 0.1, 0.0, 0.0]}[model]  # fmt: skip
+    p = np.hstack([k * [[0.8], [0.8], [1.0]], np.zeros((3, 1))])
+    info = messages(INFO, header=messages.header(START_NS), width=size[0], height=size[1], k=k.ravel(), p=p.ravel(),
+                    distortion_model=model, d=np.array(d))  # fmt: skip
+    record(tmp_path / "s", [("/camera/camera_info", info, START_NS, messages.cdr(info))])
+    with open_session(tmp_path / "s") as session:
+        found = with_recorded_camera(session, tracks, "/camera/image_rect" if rectified else "/camera/image_raw")
+    if rectified:
+        assert np.array_equal(found.camera_matrix, p[:, :3])
+        assert np.array_equal(found.keypoints, tracks.keypoints, equal_nan=True)
+    else:
+        lens = CameraModel(*size, k, np.array(d), model)
+        flat = lens.undistorted(tracks.keypoints.reshape(-1, 2)).reshape(tracks.keypoints.shape)
+        assert np.array_equal(found.camera_matrix, k)
+        assert np.array_equal(found.keypoints, flat, equal_nan=True)
+        assert np.nanmax(np.abs(flat - tracks.keypoints)) > 0.5
 
 
 def test_poses_are_sorted_and_repeated_ones_left_out(tmp_path, messages, capture):

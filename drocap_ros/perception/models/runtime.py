@@ -147,7 +147,7 @@ class Model(ABC):
 
 def network_files(folder: Path) -> list[Path]:
     """Networks of a folder, by name."""
-    return sorted(path for path in folder.glob("*") if path.suffix in SUFFIXES)
+    return sorted(path for path in folder.glob("[!.]*") if path.suffix in SUFFIXES)
 
 
 def open_model(path: Path, threads: int = 1, provider: str = "auto") -> Model:

@@ -25,19 +25,20 @@ _STREAM = re.compile(r"^(rtsps?|udp|rtp|rtmp|srt|tcp|https?)://", re.IGNORECASE)
 _CAMERA = re.compile(r"^/dev/video(\d+)$")
 
 
-def open_source(uri: str | Path, config: ImageIngestConfig | None = None) -> ImageSource:
+def open_source(uri: str | Path, config: ImageIngestConfig | None = None, track: str = "") -> ImageSource:
     """Source for a video file, an image, a folder of images, ``/dev/videoN``, or a stream's URL.
 
     uri : path or URL; ``file://`` is allowed
     config : rates, camera mode and time-outs; ``config.source`` is ignored
+    track : number of a video's track; empty: the largest
     """
     config, text = config or ImageIngestConfig(), str(uri)
     if camera := _CAMERA.match(text):
         return open_camera(int(camera[1]), config)
-    return open_stream(text, config) if _STREAM.match(text) else _open_path(text, config)
+    return open_stream(text, config) if _STREAM.match(text) else _open_path(text, config, track)
 
 
-def _open_path(text: str, config: ImageIngestConfig) -> ImageSource:
+def _open_path(text: str, config: ImageIngestConfig, track: str) -> ImageSource:
     path = Path(text.removeprefix("file://"))
     if not text or not path.exists():
         raise InputError(
@@ -48,4 +49,4 @@ def _open_path(text: str, config: ImageIngestConfig) -> ImageSource:
         return open_stream(str(path), config)
     if path.is_dir() or file_kind(path) is FileKind.IMAGE:
         return ImageFileSource(path, config.folder_rate_hz)
-    return VideoSource(path)
+    return VideoSource(path, track)

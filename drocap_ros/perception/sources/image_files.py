@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from itertools import pairwise
@@ -10,7 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.sources.base import Frame, ImageSource
+from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
+
+logger = logging.getLogger(__name__)
 
 # The header of a small file can declare an image of gigabytes.  OpenCV reads this limit when it is imported.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
@@ -198,14 +201,15 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 class ImageFileSource(ImageSource):
     """Image files of one size.
 
-    Stamps are the file names where these are times in nanoseconds, else ``rate_hz`` counts from 0.
+    Stamps are the file names where these are times in nanoseconds, else ``rate_hz`` counts from 0.  Files of a folder
+    that do not decode are gaps, and a ``DAMAGED`` event follows at the end.
     """
 
     def __init__(self, path: Path, rate_hz: float = 30.0) -> None:
         super().__init__()
         if path.is_dir():
             self._paths = sorted(
-                (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()),
+                (p for p in path.glob("[!.]*") if p.suffix.lower() in SUFFIXES and p.is_file()),
                 key=lambda p: _natural(p.name),
             )
             if not self._paths:
@@ -213,19 +217,39 @@ class ImageFileSource(ImageSource):
         else:
             self._paths = [path]
         self._stamps = _stamps(self._paths, rate_hz)
-        self._first: np.ndarray | None = read_image(self._paths[0])
+        self._next, self._damaged = 0, list[Path]()
+        self._first = self._decode()
+        if self._first is None:
+            raise InputError(
+                f"{self._damaged[0]}: expected an image (JPEG, PNG, TIFF, ...), found"
+                f" {self._damaged[0].stat().st_size} bytes that do not decode; replace it"
+            )
         self.size = (self._first.shape[1], self._first.shape[0])
         self.length = len(self._paths)
         self.duration_s = (self._stamps[-1] - self._stamps[0]) * 1e-9
-        self._next = 0
+
+    def _decode(self) -> np.ndarray | None:
+        """The next image that decodes, whose place ``_next`` then is; None at the end."""
+        while self._next < len(self._paths):
+            try:
+                return read_image(self._paths[self._next])
+            except InputError:  # noqa: PERF203  # few are damaged
+                self._damaged.append(self._paths[self._next])
+                self._next += 1
+        return None
 
     def read(self) -> Frame | None:
         """Next image, or None at the end."""
-        if self._next >= len(self._paths):
+        image, self._first = self._first if self._first is not None else self._decode(), None
+        if image is None:
+            if self._damaged:
+                words = f"images that do not decode: {len(self._damaged)}, as {self._damaged[0].name}"
+                event = SourceEvent(SourceEventKind.DAMAGED, str(self._damaged[0].parent), words)
+                self._events.append(event)
+                logger.warning(str(event))
+                self._damaged = []
             return None
         path = self._paths[self._next]
-        image = self._first if self._first is not None else read_image(path)
-        self._first = None
         if (image.shape[1], image.shape[0]) != self.size:
             raise InputError(
                 f"{path}: expected {self.size[0]}x{self.size[1]} px like the first image, got {image.shape[1]}x"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.file_kind import FileKind, file_kind
+from drocap_ros.file_kind import FileKind, file_kind, unpacking
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
 
 if TYPE_CHECKING:
@@ -141,20 +141,20 @@ def _upright(image: np.ndarray, matrix: Any) -> np.ndarray:
 
 
 class VideoSource(ImageSource):
-    """Frames of a video file, of its largest track.
+    """Frames of a video file, of its largest track, of these the longest, or of a numbered one from 1 on.
 
     A stamp is the frame's presentation time in its container, from 0 at the first; variable frame rates keep
     their times.  What an edit list hides is left out.  Decoding goes on after damage, and a ``DAMAGED`` event
     follows at the end; a file that is cut off gives its frames up to the cut and an ``ENDED_EARLY`` event.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, track: str = "") -> None:
         super().__init__()
-        self.path = path
+        self.path, self._track = path, track
         if not path.is_file():
             raise InputError(f"{path}: expected a video file, found no such file; check the path")
         if (kind := file_kind(path)) is not FileKind.VIDEO:
-            raise InputError(f"{path}: expected a video file, found {kind.value}; check the path, or record it again")
+            raise InputError(f"{path}: expected a video file, found {kind.value}{unpacking(path)}")
         self._error = pyav().error.FFmpegError
         try:
             self._container = open_container(path)
@@ -173,9 +173,12 @@ class VideoSource(ImageSource):
         """Choose the track, read what the container states, and the first picture."""
         known = [stream for stream in self._container.streams.video if stream.codec_context is not None]
         known = [s for s in known if not s.disposition & s.disposition.attached_pic] or known
+        if not known and self._container.streams.audio and not self._container.streams.video:
+            self.close()
+            raise InputError(f"{self.path}: expected a video, found sound without pictures; name the video")
         if not known:
             raise self._refused(f"no video of a known codec ({', '.join(track_codes(self.path)) or 'no track'})")
-        self._stream = max(known, key=lambda stream: stream.width * stream.height)
+        self._stream = self._chosen(known)
         self._stream.thread_type = "AUTO"
         self._decoder = Decoder(self._stream.codec_context, _time_base(self._stream), self._stream.sample_aspect_ratio)
         rate = float(self._stream.guessed_rate or 0)
@@ -188,6 +191,22 @@ class VideoSource(ImageSource):
         if first is None:
             raise self._refused(f"{self._stream.codec_context.codec.long_name} without a frame that it decodes")
         self.size = (first.image.shape[1], first.image.shape[0])
+
+    def _chosen(self, streams: list[VideoStream]) -> VideoStream:
+        tracks = {str(number): stream for number, stream in enumerate(streams, 1)}
+        if self._track:
+            if self._track not in tracks:
+                self.close()
+                raise InputError(
+                    f"--topic {self._track}: expected a video track of {self.path}, 1 to {len(tracks)}, or a topic of a"
+                    " recording; correct it"
+                )
+            return tracks[self._track]
+        largest = max(tracks, key=lambda n: (tracks[n].width * tracks[n].height, tracks[n].duration or 0))
+        if len(tracks) > 1:
+            sizes = ", ".join(f"{n} ({s.width}x{s.height} px)" for n, s in tracks.items())
+            log.warning("%s: several video tracks, %s: %s is used, --topic N is another", self.path, sizes, largest)
+        return tracks[largest]
 
     def _refused(self, found: str) -> InputError:
         self.close()

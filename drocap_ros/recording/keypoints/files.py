@@ -1,7 +1,7 @@
 """2D keypoints out of the files of other tools, as tracks of one person.
 
 JSON (OpenPose, AlphaPose, COCO, MMPose, MediaPipe, TensorFlow.js) is searched for points, frames and persons wherever
-they stand; DeepLabCut's table and arrays take the same way.  Joints are those named, else of the set of that size.
+they stand; tables and arrays take the same way.  Joints are those named, else in the order that makes a body.
 """
 
 from __future__ import annotations
@@ -13,56 +13,17 @@ import logging
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.skeleton import JOINT_SETS
+from drocap_ros.recording.keypoints.orders import counts, name_points
+from drocap_ros.recording.keypoints.tables import is_keypoint_table, read_table
 from drocap_ros.tracks import MAX_FRAMES, Tracks, kind_of, load_tracks, read_npz, save_tracks, without_unseen
-
-#: OpenPose's order of COCO's points, and BlazePose's points.
-_ARMS = "nose neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist"
-_LEGS = "r_hip r_knee r_ankle l_hip l_knee l_ankle"
-_FACE = "r_eye l_eye r_ear l_ear"
-_BLAZE = (
-    "nose l_eye_inner l_eye l_eye_outer r_eye_inner r_eye r_eye_outer l_ear r_ear l_mouth r_mouth l_shoulder r_shoulder"
-    " l_elbow r_elbow l_wrist r_wrist l_pinky r_pinky l_index r_index l_thumb r_thumb l_hip r_hip l_knee r_knee"
-    " l_ankle r_ankle l_heel r_heel l_big_toe r_big_toe"
-)
-#: Other words for a joint -> ours.
-_PARTS = {
-    "sho": "shoulder", "elb": "elbow", "wri": "wrist", "kne": "knee", "ank": "ankle",
-    "hand": "wrist", "foot_index": "big_toe", "bigtoe": "big_toe", "toe": "big_toe", "smalltoe": "small_toe",
-}  # fmt: skip
-
-
-def joint_name(name: str) -> str:
-    """Our name of a joint: ``RHip``, ``hip_R`` and ``Hip.right`` are ``right_hip``; ours stay."""
-    if any(name in joints.joints for joints in JOINT_SETS.values()):
-        return name
-    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=^[LR])(?=[A-Z][a-z])", "_", name)
-    words = [{"l": "left", "r": "right"}.get(word, word) for word in re.split(r"[\W_]+", spaced.lower()) if word]
-    part = "_".join(word for word in words if word not in ("left", "right"))
-    return "_".join([*(word for word in words if word in ("left", "right")), _PARTS.get(part, part)])
-
-
-def _names(words: str) -> tuple[str, ...]:
-    return tuple(map(joint_name, words.split()))
-
-
-#: Number of points of a public network -> their names; Halpe's 136 begin with its 26.
-NAMES_BY_COUNT = {
-    **{len(s): s.joints for name in ("mpii16", "coco17", "halpe26", "wholebody133") for s in (JOINT_SETS[name],)},
-    18: _names(f"{_ARMS} {_LEGS} {_FACE}"),
-    25: _names(f"{_ARMS} hip {_LEGS} {_FACE} l_big_toe l_small_toe l_heel r_big_toe r_small_toe r_heel"),
-    33: _names(_BLAZE),
-    136: JOINT_SETS["halpe26"].joints,
-}
-
 
 Value = TypeVar("Value")
 #: A frame's name or number, or a person's; None = not stated.
@@ -76,6 +37,10 @@ _FRAME = ("frame_id", "image_id", "frame_index", "frame", "image_name", "file_na
 _WHO = ("track_id", "idx", "person_id", "instance_id")
 _TOGETHER = ("people", "bodies", "instances", "persons", "predictions")
 _RATE = ("fps", "frame_rate", "rate_hz", "framerate")
+#: Keys of the names of joints, in their order or by their numbers.
+_NAMES = re.compile(r"(key_?points?|joints?|nodes?|body_?parts|landmarks?)_?(names?|labels?|id2name|name2id)|bodyparts")
+#: Keys of poses in space, which are no keypoints of a picture.
+_SPACE = re.compile(r"3d|world|xyz", re.IGNORECASE)
 #: Digits of a frame's number; longer ones are times or sums.
 _LONGEST_NUMBER = 10
 #: A person's least points, and most: whole bodies have 133 or 136, with a mesh of the face 543.
@@ -86,13 +51,20 @@ LARGEST_PX = 1e5
 
 @dataclass
 class Content:
-    """What a file holds; of a person its frame, its number or None, and points (P, 3): x, y px and score."""
+    """What a file holds; of a person its frame, its number or None, and points (P, 4): x, y px, score, third number.
+
+    tool : begin of the names of the orders that the file's form has
+    space : whether it holds poses in space
+    """
 
     people: list[tuple[Label, Label, np.ndarray]] = field(default_factory=list)
     frames: list[Label] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     size: tuple[int, int] | None = None
     rate_hz: float | None = None
+    pictures: dict[Label, str] = field(default_factory=dict)
+    tool: str = ""
+    space: bool = False
 
     def add(self, frame: Label, who: object, points: np.ndarray) -> None:
         """Append a person; a number below zero, as OpenPose writes it, is none."""
@@ -103,13 +75,21 @@ class Content:
             self.people.append((frame, cast("Label", who) if known else None, points))
 
     def note(self, node: Node) -> None:
-        """Take the rate and the size of the images where a mapping states them."""
+        """Take the rate, the size of the images, the names of joints and of pictures where a mapping states them."""
         rate = _first_of(node, _RATE)
         if self.rate_hz is None and isinstance(rate, int | float) and rate > 0:
             self.rate_hz = float(rate)
         width, height = node.get("width", node.get("w")), node.get("height", node.get("h"))
         if self.size is None and isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
             self.size = width, height
+        for key, value in node.items():
+            if not self.names and _NAMES.fullmatch(key.lower()):
+                self.names = _listed_names(value)
+        if isinstance(pictures := node.get("images"), list):  # of COCO: numbers of pictures need not be in their order
+            pairs = [
+                (p["id"], p["file_name"]) for p in pictures if isinstance(p, dict) and {"id", "file_name"} <= p.keys()
+            ]
+            self.pictures |= {number: str(name) for number, name in pairs if isinstance(number, int | str)}
 
 
 def walk(node: object, frame: Label, content: Content) -> None:
@@ -130,6 +110,9 @@ def _walk_object(node: Node, frame: Label, content: Content) -> None:
         content.add(frame, _first_of(node, _WHO), points)
         return
     for key, child in node.items():
+        if _SPACE.search(key):
+            content.space = True
+            continue
         below = 0 if frame is None and key in _TOGETHER else frame
         if key in _TOGETHER:
             content.frames.append(below)
@@ -138,7 +121,9 @@ def _walk_object(node: Node, frame: Label, content: Content) -> None:
 
 
 def _points_of(node: Node, content: Content) -> np.ndarray | None:
-    """Points of a person's node; names of joints go to ``content``."""
+    """Points of a person's node; names of joints and the tool go to ``content``."""
+    if "pose_keypoints_2d" in node:
+        content.tool = "openpose"
     scores = next(_lists(node, _SCORES), None)
     for value in _lists(node, _POINTS):
         points = _points(value, scores)
@@ -179,12 +164,21 @@ def _names_in(value: list[object]) -> list[str]:
     return found if len(found) == len(names) >= _LEAST else []
 
 
+def _listed_names(value: object) -> list[str]:
+    """Names of a list, or of an object from numbers to names or from names to numbers; empty of anything else."""
+    if isinstance(value, dict) and all(isinstance(number, int) for number in value.values()):
+        value = {number: name for name, number in value.items()}
+    if isinstance(value, dict) and all(str(number).isdigit() for number in value):
+        value = [value[number] for number in sorted(value, key=lambda number: int(str(number)))]
+    return _names_in(value) if isinstance(value, list) else []
+
+
 def _points(value: list[object], scores: object) -> np.ndarray | None:
-    """(P, 3) x, y, score of a person's points in any form, None where they are none."""
+    """(P, 4) of a person's points in any form, None where they are none."""
     try:
         points = np.array(_rows(value), dtype=np.float64)
         if points.ndim == 1:  # x y score of each, or x y
-            points = points.reshape(-1, 3 if len(points) % 3 == 0 and len(points) // 3 in NAMES_BY_COUNT else 2)
+            points = points.reshape(-1, 3 if len(points) % 3 == 0 and len(points) // 3 in counts() else 2)
         return _scored(points, scores) if points.ndim == 2 else None
     except (ValueError, TypeError, OverflowError, AttributeError):
         return None
@@ -197,24 +191,27 @@ def _rows(value: list[object]) -> list[object]:
         return []
     if not objects:
         return value
-    return [_row(p) for p in objects] if objects[0].keys() & {"x", "y", "name"} else []
+    return [_row(p) for p in objects] if any(p.keys() & {"x", "y", "name"} for p in objects) else []
 
 
 def _row(point: Node) -> list[object]:
     score = _first_of(point, _SCORES)
-    return [point.get("x") or 0, point.get("y") or 0, 1 if score is None else score]
+    return [point.get("x") or 0, point.get("y") or 0, point.get("z") or 0, 1 if score in (None, "") else score]
 
 
 def _scored(points: np.ndarray, scores: object) -> np.ndarray | None:
-    """(..., P, 3) x, y, score of points (..., P, 2 to 4) and their scores; None where they are none."""
+    """(..., P, 4) x, y, score, third of points (..., P, 2 to 4) and their scores; None where they are none."""
     if not _LEAST <= points.shape[-2] <= _MOST or not 2 <= points.shape[-1] <= 4:  # x, y, z, score
         return None
     given: np.ndarray = points[..., -1] if scores is None else np.array(scores, dtype=np.float64)
     # A last number below zero is a depth, as MediaPipe writes it.
     if given.size != points[..., 0].size or (scores is None and (points.shape[-1] == 2 or (given < 0).any())):
         given = np.ones(points.shape[:-1])
-    found: np.ndarray = np.concatenate([points[..., :2], given.reshape(*points.shape[:-1], 1)], axis=-1)
-    found[~(np.isfinite(found).all(axis=-1) & (found[..., 2] > 0) & (found[..., :2] > 0).any(axis=-1))] = np.nan
+    third = points[..., 2] if points.shape[-1] > 2 else np.zeros(points.shape[:-1])
+    found: np.ndarray = np.stack([*np.moveaxis(points[..., :2], -1, 0), given.reshape(third.shape), third], axis=-1)
+    marked = (found[..., :2] == 0).all(axis=-1) | (found[..., :2] == -1).all(axis=-1)
+    seen = np.isfinite(found[..., :3]).all(axis=-1) & (found[..., 2] > 0) & ~marked
+    found[~seen] = np.nan
     return found
 
 
@@ -234,6 +231,11 @@ def one_person(people: list[tuple[int, Label, np.ndarray]]) -> dict[int, np.ndar
     return chosen
 
 
+def _natural(label: Label) -> list[tuple[int, str]]:
+    """Sort key that puts frame_2 before frame_10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(label)) if part]
+
+
 def numbers_of(labels: list[Label]) -> dict[Label, int]:
     """Number of each frame: the last one in its name where that tells frames apart, else its place."""
     names = list(dict.fromkeys(labels))
@@ -244,8 +246,11 @@ def numbers_of(labels: list[Label]) -> dict[Label, int]:
 
 def read_arrays(arrays: Mapping[str, np.ndarray], content: Content) -> None:
     """Collect the persons, joints, rate and size of arrays by name."""
-    content.names = np.atleast_1d(arrays.get("joints", ())).astype(str).tolist()
-    numbers = {name: array for name, array in arrays.items() if array.dtype.kind in "fiu"}
+    words = {name: array.ravel().astype(str).tolist() for name, array in arrays.items() if array.dtype.kind in "US"}
+    content.names = words.get("joints", [])
+    content.note(words)
+    content.space = any(map(_SPACE.search, arrays))
+    numbers = {name: array for name, array in arrays.items() if array.dtype.kind in "fiu" and not _SPACE.search(name)}
     size = numbers.get("image_size", np.zeros(0))
     if size.shape == (2,) and ((size >= 1) & (size <= LARGEST_PX)).all():
         content.size = int(size[0]), int(size[1])
@@ -255,31 +260,12 @@ def read_arrays(arrays: Mapping[str, np.ndarray], content: Content) -> None:
 
 
 def _points_in(arrays: Mapping[str, np.ndarray]) -> Iterable[np.ndarray]:
-    """(F, P, 3) of the first array (F, P, 2 to 4) that holds points; empty where none does."""
+    """(F, P, 4) of the first array (F, P, 2 to 4) that holds points; empty where none does."""
     for value in (arrays[name] for name in (*_POINTS, *arrays) if name in arrays):
         points = _scored(value.astype(np.float64), _first_of(arrays, _SCORES)) if value.ndim == 3 else None
         if points is not None and np.isfinite(points).any():
             return points
     return ()
-
-
-def table(path: Path) -> Iterator[Node]:
-    """DeepLabCut's table as JSON: rows that begin with scorer, individuals, bodyparts, coords; then one row a frame."""
-    with path.open("r", encoding="utf-8-sig", errors="replace", newline="") as file:
-        semicolons = ";" in file.readline()
-        file.seek(0)
-        rows = [row for row in csv.reader(file, delimiter=";" if semicolons else ",") if row]
-    head = {row[0].strip(): row[1:] for row in rows[:4] if not row[0].strip().isdigit()}
-    if not {"bodyparts", "coords"} <= head.keys():
-        raise InputError("expected the rows bodyparts and coords of DeepLabCut, found others; export the CSV again")
-    whose = head.get("individuals", [""] * len(head["coords"]))
-    columns = list(zip(whose, head["bodyparts"], head["coords"], strict=False))
-    for row in rows[len(head) :]:
-        people: dict[str, dict[str, dict[str, str]]] = {}
-        for (who, part, coord), text in zip(columns, row[1:], strict=False):
-            people.setdefault(who, {}).setdefault(part, {"name": part})[coord] = text
-        persons = [{"person_id": w, "keypoints": list(parts.values())} for w, parts in people.items()]
-        yield {"frame_id": row[0], "people": persons}
 
 
 logger = logging.getLogger(__name__)
@@ -292,6 +278,10 @@ _USUAL_HZ = 30.0
 #: Coordinates that are all within the first are shares of the picture.  Scores beyond the second are no shares of one:
 #: some networks exceed 1 a little, and COCO's flags end there.
 _LARGEST_SHARE, _HIGHEST_SCORE = 2.0, 2.0
+#: Share of coordinates below zero from which they are about a middle; persons at the edge have few.
+_MOST_BELOW = 0.1
+#: No network sees a person of fewer px.
+_SMALLEST_PX = 6.0
 #: Frames so many times as far apart as they are many are no video's.
 _SPARSE = 10
 
@@ -300,61 +290,66 @@ def is_keypoint_file(path: Path) -> bool:
     """Whether a file, by its name and for ``.csv`` its first word, or a folder of JSON files, holds 2D keypoints."""
     if path.is_dir():
         return {p.suffix for p in path.iterdir() if not p.name.startswith(".")} == {".json"}
-    if path.suffix.lower() == ".csv" and path.is_file():
-        with path.open("rb") as file:
-            return re.match(rb'(\xef\xbb\xbf)?"?(scorer|bodyparts)\b', file.read(24)) is not None
+    if path.suffix.lower() in (".csv", ".tsv") and path.is_file():
+        return is_keypoint_table(path)
     return path.suffix.lower() in (".npz", ".npy", ".json", ".pkl", ".h5")
 
 
+class Stated(NamedTuple):
+    """What a user says of a file: images per second, their size px, the order of the joints; None where nothing."""
+
+    rate_hz: float | None = None
+    size: tuple[int, int] | None = None
+    order: str | None = None
+
+
 @contextlib.contextmanager
-def as_tracks_file(path: Path, rate_hz: float | None, size: tuple[int, int] | None) -> Iterator[Path]:
+def as_tracks_file(path: Path, stated: Stated) -> Iterator[Path]:
     """The input itself, or for another tool's keypoints a tracks file of them that is there for the time being."""
     arrays = read_npz(path, ()) if path.suffix == ".npz" and path.is_file() else {}
-    if (
-        not is_keypoint_file(path)
-        or not path.exists()
-        or kind_of(arrays) in ("motion", "MoCap")
-        or arrays.keys() >= _OWN
-    ):
+    own = arrays.keys() >= _OWN and stated.order is None
+    if not is_keypoint_file(path) or not path.exists() or kind_of(arrays) in ("motion", "MoCap") or own:
+        if stated.order is not None:
+            raise InputError(f"--order {stated.order}: expected a file of 2D keypoints, found {path}; leave it out")
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
-        save_tracks(Path(folder) / f"{path.stem}.npz", read_keypoints(path, rate_hz, size))
+        save_tracks(Path(folder) / f"{path.stem}.npz", read_keypoints(path, stated))
         yield Path(folder) / f"{path.stem}.npz"
 
 
-def read_keypoints(path: Path, rate_hz: float | None = None, size: tuple[int, int] | None = None) -> Tracks:
+def read_keypoints(path: Path, stated: Stated = Stated()) -> Tracks:  # noqa: B008  # immutable
     """Tracks of a file of our own, or of the person in most frames of another tool's.
 
-    Without ``rate_hz`` and ``size`` (width, height) px these are the file's; else 30 and a person in the middle.  Where
-    the size is known, a network's file is of pictures of a lens.
+    What is not stated is the file's; else 30 images per second, a person in the middle, and the order of the joints
+    that makes a body.  Where the size is known, a network's file is of pictures of a lens.
     """
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise InputError("expected a file of 2D keypoints, found a pipe or device; name a file")
-        content = _content(path)
+        content = _content(path, own=stated.order is None)
         if isinstance(content, Tracks):
-            return content if rate_hz is None else content.at_rate(rate_hz)
-        return _tracks(path, content, rate_hz or content.rate_hz, size or content.size)
+            return content if stated.rate_hz is None else content.at_rate(stated.rate_hz)
+        return _tracks(path, content, stated)
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except (OSError, ValueError, EOFError, RecursionError, MemoryError, csv.Error) as error:
         raise InputError(f"{path}: expected 2D keypoints; {first_line(error)}; check the file") from None
 
 
-def _content(path: Path) -> Content | Tracks:
+def _content(path: Path, *, own: bool) -> Content | Tracks:
     content, suffix = Content(), path.suffix.lower()
     if path.is_dir():
-        for file in sorted(path.glob("*.json"))[: MAX_FRAMES + 1]:
+        for file in sorted(path.glob("[!.]*.json"))[: MAX_FRAMES + 1]:
             content.frames.append(file.stem.removesuffix("_keypoints"))
             walk(json.loads(file.read_bytes()), content.frames[-1], content)
     elif suffix == ".json":
         walk(json.loads(path.read_bytes()), None, content)
-    elif suffix == ".csv":
-        walk(list(table(path)), None, content)
+    elif suffix in (".csv", ".tsv"):
+        walk(list(read_table(path)), None, content)
     elif suffix in _ARRAYS:
         arrays = {"keypoints": np.load(path, allow_pickle=False)} if suffix == ".npy" else read_npz(path, ())
-        if arrays.keys() >= _OWN:
+        if own and arrays.keys() >= _OWN:
             return load_tracks(path)
         read_arrays(arrays, content)
     else:
@@ -362,16 +357,16 @@ def _content(path: Path) -> Content | Tracks:
     return content
 
 
-def _tracks(path: Path, content: Content, rate_hz: float | None, size: tuple[int, int] | None) -> Tracks:
+def _tracks(path: Path, content: Content, stated: Stated) -> Tracks:
     """Tracks of the person in most frames; warns of what is assumed."""
-    frames, names, points = _series(path, content)
-    xy, scores = points[..., :2], np.nan_to_num(points[..., 2])
+    frames, points = _series(path, content)
+    rate_hz, size = stated.rate_hz or content.rate_hz, stated.size or content.size
+    scores, third = np.nan_to_num(points[..., 2]), points[..., 3]
     if scores.max(initial=0.0) > _HIGHEST_SCORE:  # per cent, or a heat map's unit
         scores = scores / scores.max()
-    if np.nanmax(xy) <= _LARGEST_SHARE:
-        if size is None:
-            raise InputError("expected px, found shares of the picture; give its size with --image-size WxH")
-        xy = xy * size
+    spatial = content.space or bool((third < 0).any() or np.nanmax(third, initial=0.0) > _HIGHEST_SCORE)
+    xy = _pixels(points[..., :2], size, spatial)
+    names, words = name_points(xy, content.names, stated.order, content.tool)
     # Networks see pictures; arrays come from anywhere.  A guessed size of the picture gives no lens: where keypoints
     # are of a part about the person, it would be far too short.
     pictures = size is not None and path.suffix.lower() not in _ARRAYS
@@ -380,38 +375,61 @@ def _tracks(path: Path, content: Content, rate_hz: float | None, size: tuple[int
         middle, end = np.nanmedian(xy, axis=(0, 1)), np.nanmax(xy, axis=(0, 1))
         size = tuple(np.ceil(np.clip(np.maximum(2 * middle, end), 1, LARGEST_PX)).astype(int).tolist())
         assumed.append(f"the person in the middle of images of {size[0]}x{size[1]} px (--image-size WxH)")
+    if words:
+        logger.warning("%s: %s", path, words)
     if assumed:
         logger.warning("%s: the file does not say, assumed: %s", path, ", ".join(assumed))
+    used = len(names)
     return Tracks(
-        keypoints=without_unseen(path, xy, np.array(size)),
-        joints=tuple(map(joint_name, names)),
+        keypoints=without_unseen(path, xy[:, :used], np.array(size)),
+        joints=names,
         stamp_ns=np.round((frames - frames[0]) * (1e9 / (rate_hz or _USUAL_HZ))).astype(np.int64),
         image_size=(size[0], size[1]),
-        confidence=np.clip(scores, 0.0, 1.0),
+        confidence=np.clip(scores[:, :used], 0.0, 1.0),
         real_lens=pictures,
     )
 
 
-def _series(path: Path, content: Content) -> tuple[np.ndarray, Sequence[str], np.ndarray]:
-    """Numbers (F,) of the frames, names (P) of the joints, and the person's points (F, P, 3), NaN where unseen."""
-    counts = Counter(len(points) for _, _, points in content.people)
-    if not counts:
-        raise InputError("expected 2D keypoints of a person, found none; check the file")
-    count = counts.most_common(1)[0][0]
-    names = content.names if len(content.names) == count else NAMES_BY_COUNT.get(count, ())
-    if not names:
-        raise InputError(f"expected points with names, or {', '.join(map(str, NAMES_BY_COUNT))} of them, found {count}")
+def _pixels(xy: np.ndarray, size: tuple[int, int] | None, spatial: bool) -> np.ndarray:
+    """Points (F, P, 2) in px; those in shares of the picture are scaled, those in no picture refused."""
+    hint = ", as of 3D poses" if spatial else ""
+    low, high = float(np.nanmin(xy)), float(np.nanmax(xy))
+    below = float(np.mean(xy[np.isfinite(xy)] < 0))
+    if below > _MOST_BELOW:
+        raise InputError(
+            f"expected px of the whole picture, found coordinates from {low:.4g} to {high:.4g}{hint}, about a middle;"
+            " convert them to px, x right and y down from the picture's corner; of 3D poses take their 2D keypoints"
+        )
+    if high <= _LARGEST_SHARE:
+        if size is None:
+            raise InputError(f"expected px, found shares of the picture{hint}; give its size with --image-size WxH")
+        return xy * size
+    seen = xy[np.isfinite(xy).any(axis=(1, 2))]
+    extent = float(np.median(np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1), axis=0).max())
+    if extent < _SMALLEST_PX:
+        raise InputError(f"expected px, found a person of {extent:.3g}{hint}, as in metres; convert them to px")
+    return xy
+
+
+def _series(path: Path, content: Content) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (F,) of the frames, and the person's points (F, P, 4), NaN where unseen."""
+    counted = Counter(len(points) for _, _, points in content.people)
+    if not counted:
+        found = "3D poses; take the 2D keypoints of the pictures" if content.space else "none; check the file"
+        raise InputError(f"expected 2D keypoints of a person, found {found}")
+    count = counted.most_common(1)[0][0]
     frames, people = _by_time(content, count)
     if len({frame for frame, _, _ in people}) < len(people):
         logger.warning("%s: several persons, the one in most frames or the largest is reconstructed", path)
-    chosen, missing = one_person(people), np.full((count, 3), np.nan)
-    return frames, names, np.stack([chosen.get(frame, missing) for frame in frames.tolist()])[:, : len(names)]
+    chosen, missing = one_person(people), np.full((count, 4), np.nan)
+    return frames, np.stack([chosen.get(frame, missing) for frame in frames.tolist()])
 
 
 def _by_time(content: Content, count: int) -> tuple[np.ndarray, list[tuple[int, Label, np.ndarray]]]:
     """Numbers (F,) of the frames, gaps filled up, and the persons of ``count`` points by these numbers."""
-    numbers = numbers_of(content.frames)
-    people = [(numbers[frame], who, p) for frame, who, p in content.people if len(p) == count]
+    labels = {frame: content.pictures.get(frame, frame) for frame in content.frames}
+    numbers = numbers_of(sorted(labels.values(), key=_natural) if content.pictures else content.frames)
+    people = [(numbers[labels[frame]], who, p) for frame, who, p in content.people if len(p) == count]
     frames = np.unique(list(numbers.values()))
     step = np.gcd.reduce(np.diff(frames)) if len(frames) > 1 else 1
     if (frames[-1] - frames[0]) // step < min(_SPARSE * len(frames), MAX_FRAMES):

@@ -219,7 +219,7 @@ def custom_metadata(description: Yaml) -> dict[str, str]:
 
 def storage_files(folder: Path, description: Yaml) -> list[Path]:
     """Files of a folder in their order, with MCAP files that a crash left out of the description."""
-    there = sorted(folder.glob("*.mcap"), key=_by_number)
+    there = sorted(folder.glob("[!.]*.mcap"), key=_by_number)
     named = description.get("relative_file_paths")
     files = [folder / Path(str(name)).name for name in named] if isinstance(named, list) else []
     if not all(file.is_file() for file in files):

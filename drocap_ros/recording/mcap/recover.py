@@ -75,7 +75,7 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
         raise InputError(f"{path}: expected a session folder or .mcap, found no such file; check the path")
     if not path.is_dir():
         if not path.is_file() or path.suffix != ".mcap":
-            raise InputError(f"{path}: expected a session folder or .mcap, found another kind of file; check the path")
+            raise InputError(f"{path}: expected a session folder or .mcap, found another kind of file; check the file")
         return [path], {}
     description, _ = bag.read_metadata(path)
     files = bag.storage_files(path, description)
@@ -93,7 +93,7 @@ def _recover_file(path: Path, one_of_several: bool) -> RecoveredFile:
         if not one_of_several and size == 0:
             raise InputError(f"{path}: expected an MCAP file, found 0 bytes; there is nothing in it to repair")
         if not MAGIC.startswith(path.read_bytes()):
-            raise InputError(f"{path}: expected an MCAP file, found other content at its start; check the path")
+            raise InputError(f"{path}: expected an MCAP file, found other content at its start; check the file")
         return _replace(stream, beside, 0, (Damage(DamageKind.NO_MESSAGE),))
     count = sum(1 for _ in stream.messages())
     damage = tuple(stream.damage)

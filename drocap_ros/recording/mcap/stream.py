@@ -218,7 +218,7 @@ class McapStream:
             magic, bad_chunks = file.read(len(MAGIC)), 0
             if magic != MAGIC and not (self.resync and _few_bits_apart(magic, MAGIC)):
                 raise InputError(
-                    f"{self.path}: expected an MCAP file, found other content at its start; check the path"
+                    f"{self.path}: expected an MCAP file, found other content at its start; check the file"
                 )
             place: int | None = file.tell()
             while place is not None:

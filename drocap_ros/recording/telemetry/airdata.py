@@ -52,6 +52,7 @@ _COLUMNS: dict[str, tuple[str, _Units]] = {
     "gimbal_heading": ("gimbal yaw", _DEG),
     **{f"{before}{a}": (a, _DEG) for a in _AIRCRAFT for before in ("", "osd.")},
     **{f"{before}{a}": (f"gimbal {a}", _DEG) for a in _AIRCRAFT for before in ("gimbal_", "gimbal.")},
+    **dict.fromkeys(("fov_h", "hfov", "camera_fov", "camera.fov", "horizontal_fov"), ("view", _DEG)),
     **{f"gimbal{a}raw": (f"gimbal {a}", {"": 0.1}) for a in _AIRCRAFT},
 }  # fmt: skip
 
@@ -77,8 +78,14 @@ def read_airdata(path: Path) -> TelemetryLog:
         # The column has whole seconds.
         utc_minus_stamp_ns=round((float(np.nanmedian(utc_s)) + 0.5) * 1e9) if np.isfinite(utc_s).any() else None,
         video_parts=tuple((int(stamp_ns[a]), int(stamp_ns[b - 1])) for a, b in video),
-        lens=Lens(),
+        lens=_lens(table.columns("view")[:, 0]),
     )
+
+
+def _lens(view_deg: np.ndarray) -> Lens:
+    """The lens of a column of fields of view (N,) deg, the usual one where there is none."""
+    stated = view_deg[(view_deg >= 5) & (view_deg <= 170)]
+    return Lens.of_view(float(np.median(stated)), "as the log states") if len(stated) else Lens()
 
 
 class _Table:

@@ -1,8 +1,9 @@
-"""States of the vehicle from an ArduPilot DataFlash log (``.bin``), through pymavlink's reader."""
+"""States of the vehicle from an ArduPilot DataFlash log, binary (``.bin``) or text, through pymavlink's reader."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -19,6 +20,7 @@ from drocap_ros.recording.telemetry.log import (
     LogLack,
     TelemetryLog,
     at_stamps,
+    choose,
     from_first_fix,
     make_log,
 )
@@ -34,18 +36,24 @@ _EARLIEST_UTC_S = 1e9
 _FIELDS = {
     "ATT": ("Roll", "Pitch", "Yaw"),
     "POS": ("Lat", "Lng", "Alt"),
-    "MNT": ("Roll", "Pitch", "YawE", "YawB"),
+    "GPS": ("Lat", "Lng", "Alt", "Status"),
+    "MNT": ("Roll", "Pitch", "YawE", "YawB", "I"),
 }
+_FIX_3D = 3  # status of a GPS with a fix in three dimensions; more are better ones
 _PARAMETER = "PARM"
-#: ArduPilot's parameter for the kind of its first mount; 1 = servos.
-_MOUNT_TYPE = "MNT1_TYPE"
+#: ArduPilot's parameter for the kind of a mount, by its number from 1 on; of the first one also without a number.
+_MOUNT_TYPE = re.compile(r"MNT(\d?)_TYPE")
 _SERVOS = 1  # of that parameter
+#: ... for the mount of the first camera, from 1 on; 0 = the first.
+_CAMERA_MOUNT = "CAM1_MNT_INST"
 
 
-def read_dataflash(path: Path) -> TelemetryLog:
-    """Attitude (ATT), position (POS) and mount (MNT) by time since power-up; UTC from the GPS.
+def read_dataflash(path: Path, *, mount: str = "") -> TelemetryLog:
+    """Attitude (ATT), position (POS, else GPS) and mount (MNT) by time since power-up; UTC from the GPS.
 
     The angles of servos (``MNT1_TYPE`` is 1) are against the body, those of other mounts against horizon and north.
+
+    mount : from 1 on; empty: the camera's by the autopilot's setting, else that with most states
     """
     content, lacks = _Content(), []
     try:
@@ -57,13 +65,13 @@ def read_dataflash(path: Path) -> TelemetryLog:
         if not content.rows["ATT"]:
             reason = first_line(error)
             raise InputError(f"{path}: expected an ArduPilot DataFlash log that can be read; {reason}") from None
-        lacks.append(LogLack(Lack.DAMAGED))
+        lacks.append(LogLack(Lack.DAMAGED, "read up to the damage"))
     if not content.rows["ATT"]:
         raise InputError(f"{path}: expected ATT messages of an ArduPilot log, found none; is it a DataFlash .bin?")
     stamp_ns, angles = content.series("ATT")
     body = quaternion_from_euler(*np.deg2rad(angles).T).T
     position, position_lacks = _position(content, stamp_ns)
-    gimbal, gimbal_lacks = _gimbal(content, stamp_ns, body)
+    gimbal, gimbal_lacks = _gimbal(path, content, stamp_ns, body, mount)
     lacks += position_lacks + gimbal_lacks
     attitude, kind = orientation_to_ros(body), "ArduPilot DataFlash log"
     log = make_log(path, kind, stamp_ns, lacks, orientation=attitude, position=position, gimbal=gimbal)
@@ -76,13 +84,16 @@ class _Content:
     def __init__(self) -> None:
         self.rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in _FIELDS}
         self.utc_us: list[float] = []
-        self.servos = False
+        self.servos: set[int] = set()
+        self.camera_mount = 0
 
     def take(self, message: DFMessage) -> None:
         name = message.get_type()
         if name == _PARAMETER:
-            if message.Name == _MOUNT_TYPE:
-                self.servos = message.Value == _SERVOS
+            if (mount := _MOUNT_TYPE.fullmatch(message.Name)) and message.Value == _SERVOS:
+                self.servos.add(int(mount[1] or 1))
+            elif message.Name == _CAMERA_MOUNT:
+                self.camera_mount = int(message.Value)
             return
         values = (float(getattr(message, field, np.nan)) for field in _FIELDS[name])
         self.rows[name].append((float(message.TimeUS), *values))
@@ -97,43 +108,56 @@ class _Content:
 
 
 def _position(content: _Content, stamp_ns: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
-    if not content.rows["POS"]:
-        return None, []
-    known_ns, geodetic = content.series("POS")
-    geodetic[(geodetic[:, :2] == 0).all(axis=1)] = np.nan
-    enu = from_first_fix(geodetic)
-    if enu is None:
-        return None, []
-    return at_stamps(known_ns, enu, stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, "POS")]
+    for name in ("POS", "GPS"):
+        if not content.rows[name]:
+            continue
+        known_ns, geodetic = content.series(name)
+        lost = (geodetic[:, :2] == 0).all(axis=1) | (geodetic[:, 3:] < _FIX_3D).any(axis=1)
+        geodetic[lost] = np.nan
+        if (enu := from_first_fix(geodetic[:, :3])) is not None:
+            return at_stamps(known_ns, enu, stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, name)]
+    return None, []
 
 
-def _gimbal(content: _Content, stamp_ns: np.ndarray, body: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
+def _gimbal(
+    path: Path, content: _Content, stamp_ns: np.ndarray, body: np.ndarray, wanted: str
+) -> tuple[np.ndarray | None, list[LogLack]]:
     if not content.rows["MNT"]:
         return None, []
     known_ns, mount = content.series("MNT")
-    yaw = "YawB" if content.servos else "YawE"
+    numbers = np.nan_to_num(mount[:, _FIELDS["MNT"].index("I")]).astype(int) + 1
+    found = {str(number): int((numbers == number).sum()) for number in np.unique(numbers)}
+    own = str(content.camera_mount) if str(content.camera_mount) in found else ""
+    number, lacks = choose(path, "mount", found, wanted or own)
+    chosen, servos = numbers == int(number), int(number) in content.servos
+    yaw = "YawB" if servos else "YawE"
     used = [_FIELDS["MNT"].index(field) for field in ("Roll", "Pitch", yaw)]
-    camera = quaternion_from_euler(*np.deg2rad(mount[:, used]).T).T
+    camera = quaternion_from_euler(*np.deg2rad(mount[chosen][:, used]).T).T
     if not np.isfinite(camera).all(axis=1).any():
-        return None, [LogLack(Lack.MOUNT_YAW, f"MNT.{yaw}")]
-    camera = at_stamps(known_ns, camera, stamp_ns, spherical=True)
-    return orientation_to_ros(quaternion_multiply(body, camera) if content.servos else camera), []
+        return None, [*lacks, LogLack(Lack.MOUNT_YAW, f"MNT.{yaw}")]
+    camera = at_stamps(known_ns[chosen], camera, stamp_ns, spherical=True)
+    return orientation_to_ros(quaternion_multiply(body, camera) if servos else camera), lacks
 
 
 def _messages(path: Path) -> Iterator[DFMessage]:
-    from pymavlink.DFReader import DFReader_binary
+    from pymavlink.DFReader import DFReader_binary, DFReader_text
 
     class Reader(DFReader_binary):  # type: ignore[misc]  # pymavlink has no types
         # The compiled index prints a line for every byte that it cannot parse.
         def init_arrays_fast(self, progress_callback: Callable[[float], None] | None = None) -> None:
             self.init_arrays(progress_callback=progress_callback)
 
-    log = Reader(str(path))
+    with path.open("rb") as file:
+        binary = file.read(len(_HEAD)) == _HEAD
+    log = (Reader if binary else DFReader_text)(str(path))
     try:
         while (message := log.recv_match(type=[*_FIELDS, _PARAMETER])) is not None:
             yield message
     finally:
-        log.close()
+        if binary:
+            log.close()
 
 
-FORMAT = LogFormat(".bin", read_dataflash, magic=b"\xa3\x95\x80")
+_HEAD = b"\xa3\x95"
+FORMAT = LogFormat(".bin", read_dataflash, magic=_HEAD + b"\x80", chooses=("mount",))
+TEXT_FORMAT = LogFormat(".log", read_dataflash, magic=b"FMT, ", chooses=("mount",))

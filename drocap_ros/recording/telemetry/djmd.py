@@ -15,6 +15,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle import orientation_to_ros
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.recording.telemetry import djmd_layouts as layouts
+from drocap_ros.recording.telemetry import gpmf
 from drocap_ros.recording.telemetry.djmd_layouts import Layout, Message, Model, Value
 from drocap_ros.recording.telemetry.log import (
     Lack,
@@ -57,9 +58,9 @@ _COLUMNS = (3, 6, 10, 13, 15, 16)
 
 
 def has_djmd(path: Path) -> bool:
-    """Whether a file is a video with such a track, or with subtitles."""
+    """Whether a file is a video with such a track, with subtitles, or with a GoPro's."""
     try:
-        return find_track(path, (_FORMAT, *TEXT_TRACKS)) is not None
+        return find_track(path, (_FORMAT, *TEXT_TRACKS, gpmf.CODE)) is not None
     except OSError:
         return False
 
@@ -69,17 +70,17 @@ def read_djmd(path: Path) -> TelemetryLog:
 
     Raises OSError when the file cannot be read.
     """
-    found = find_track(path, (_FORMAT, *TEXT_TRACKS))
+    found = find_track(path, (_FORMAT, *TEXT_TRACKS, gpmf.CODE))
     if found is None:
         raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
-    if found[1] != _FORMAT:
+    if found[1] in TEXT_TRACKS:
         return read_srt(path)
     try:
-        return _to_log(path, found[0])
+        return gpmf.read_gpmf(path, found[0]) if found[1] == gpmf.CODE else _to_log(path, found[0])
     except InputError as error:
         words = str(error)
         raise InputError(
-            words if words.startswith(str(path)) else f"{path}: djmd track: {words}; copy it again"
+            words if words.startswith(str(path)) else f"{path}: {found[1]} track: {words}; copy it again"
         ) from None
 
 

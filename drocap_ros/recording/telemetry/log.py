@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
@@ -289,6 +289,12 @@ class Lens(NamedTuple):
     origin: str = f"{_USUAL_MM:g} mm equivalent assumed, as of most DJI main cameras"
     zoom: float = 1.0
 
+    @classmethod
+    def of_view(cls, fov_deg: float, origin: str) -> Lens:
+        """A lens by its horizontal field of view across the longer side of the image."""
+        focal_mm = 0.5 * _EQUIVALENT_WIDTH_MM / math.tan(math.radians(0.5 * fov_deg))
+        return cls(focal_mm, f"{fov_deg:g} deg across the image, {origin}")
+
     def __str__(self) -> str:
         return self.origin if self.zoom == 1.0 else f"{self.origin}, digital zoom {self.zoom:g}"
 
@@ -305,10 +311,12 @@ class Lack(Enum):
     VEHICLE_ATTITUDE = "no vehicle attitude in the log"
     POSITION = "no position in the log"
     LOCAL_POSITION = "no valid local position in the log: positions are relative to the first of {}"
+    SEVERAL = "several {}"
+    HEIGHT_UNKNOWN = "no height in the log: it is taken as constant"
     HEIGHT = "no height above take-off in the log: heights are relative to the first {}"
     MOUNT_YAW = "no yaw of the mount relative to north in the log ({})"
     DROPOUTS = "{} dropouts in the log: parts of the flight are missing"
-    DAMAGED = "the log is damaged: read up to the damage"
+    DAMAGED = "the log is damaged: {}"
     DAMAGED_STATES = "{} of the states are damaged: left out"
     AIRCRAFT_ZERO = "the aircraft's angles are zero throughout: left out"
     QUATERNION = "the gimbal's quaternion contradicts its angles: the angles are used"
@@ -354,19 +362,34 @@ class TelemetryLog(NamedTuple):
 class LogFormat(NamedTuple):
     """A format of telemetry; each reader's module registers its own in ``read.py``.
 
+    chooses : of what a log may hold several, as keywords of ``read``; the first is that of a name without a keyword
     suffix : of the name of a log beside a video; empty = the telemetry is inside the video
     magic, at : bytes by which the content is known, and their place within the first sixteen; empty = the name alone
     read : reader of a file of this format
     """
 
     suffix: str
-    read: Callable[[Path], TelemetryLog]
+    read: Callable[..., TelemetryLog]
     magic: bytes = b""
     at: int = 0
+    chooses: tuple[str, ...] = ()
 
     def begins(self, head: bytes) -> bool:
         """Whether the first bytes of a file are of this format."""
         return bool(self.magic) and head[self.at :].startswith(self.magic)
+
+
+def choose(path: Path, what: str, found: Mapping[str, int], wanted: str) -> tuple[str, list[LogLack]]:
+    """The wanted one of several vehicles, mounts or tracks, else the first of those with most states; words on both.
+
+    found : number of states of each
+    """
+    name = wanted or max(found, key=lambda each: found[each])
+    if name not in found:
+        raise InputError(f"{path}#{what}={name}: expected one of {', '.join(found)}, found another name; correct it")
+    states = ", ".join(f"{each} ({count} states)" for each, count in found.items())
+    words = f"{what}s in the log, {states}: {name} is used; {path.name}#{what}=NAME as LOG chooses another"
+    return name, [LogLack(Lack.SEVERAL, words)] if len(found) > 1 else []
 
 
 def make_log(

@@ -3,7 +3,7 @@
 Supported forms: bracketed ``[latitude: 47.3] [rel_alt: 10.0 abs_alt: 450.1] [gb_yaw: 12.3 gb_pitch: -20.0
 gb_roll: 0.0]``, the gimbal also as ``gimbal_yaw``, the aircraft as ``drone_yaw`` or ``flight_yaw``; ``F_PRY (..°, ..°,
 ..°), G.PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older ``GPS(lon,lat,n) BAROMETER:20.5``, of some models
-``GPS(lat,lon,0.0M)`` or ``GPS(E:lon, N:lat, 5.0m)``.
+``GPS(lat,lon,0.0M)`` or ``GPS(E:lon, N:lat, 5.0m)``, with RTK ``RTK (lon, lat, n)``.
 """
 
 from __future__ import annotations
@@ -43,19 +43,30 @@ _VALUE = re.compile(rf"\b(latitude|longitude|longtitude|rel_alt|abs_alt|altitude
 #: Angles by name: of the gimbal, or of the aircraft.
 _ANGLE = re.compile(rf"\b(gb|gimbal|drone|flight|aircraft)[_. ]?(pitch|roll|yaw)(?:degree)?\s*:\s*{_NUMBER}", re.I)
 _CLOCK = re.compile(r"\d\s+(\d{1,2}):(\d\d):(\d\d[.,]\d{3})")
-_GPS = re.compile(rf"\bGPS\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I)
-_BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
+_GPS = re.compile(
+    rf"\b(?:GPS|RTK)\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I
+)
+_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
+#: Place of take-off, and the distance from it, m.
+_DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*{_NUMBER}\s*m")
+_METRES_PER_DEG = 111_320.0  # of latitude
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
+_VIEWS_DEG = (5.0, 170.0)  # possible fields of view
+#: Horizontal field of view, deg.
+_VIEW = re.compile(rf"\b(?:fov_?h|h_?fov|horizontal_?fov|fov_?horizontal)\s*[:=]\s*{_NUMBER}", re.IGNORECASE)
 #: Pitch, roll and yaw; the degree sign may be in any encoding.
 _THREE = r"[^-+,()0-9]{0,8},\s*".join([_NUMBER] * 3)
 _PRY = re.compile(rf"\b([FG])[._ ]?PRY\s*:?\s*\(\s*{_THREE}[^,()0-9]{{0,8}}\)", re.IGNORECASE)
 
 
 class _Entry(NamedTuple):
-    """One subtitle: time ns in the video; latitude, longitude deg and height m; pitch roll yaw deg; lens mm and zoom.
+    """One subtitle: time ns in the video; latitude, longitude deg and height m; pitch roll yaw deg.
 
+    lens : mm, digital zoom, view deg
     kind : of the height, "" = none
     clock_s : time of day
+    home : place of take-off in the order of the text, and the distance from it, m
+    plain : whether nothing beside the numbers says which of them is the latitude
     """
 
     stamp_ns: int
@@ -63,8 +74,10 @@ class _Entry(NamedTuple):
     kind: str
     gimbal: tuple[float, float, float]
     body: tuple[float, float, float]
-    lens: tuple[float, float]
+    lens: tuple[float, float, float]
     clock_s: float
+    home: tuple[float, float, float]
+    plain: bool
 
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
@@ -73,16 +86,23 @@ _UNKNOWN = (math.nan, math.nan, math.nan)
 def read_srt(path: Path) -> TelemetryLog:
     """Gimbal attitude and position of every subtitle, by the video's own clock."""
     entries = _entries(path)
-    stamps, places, kinds, gimbal, body, lens, clock_s = map(np.array, zip(*entries, strict=True))
+    stamps, places, kinds, gimbal, body, lens, clock_s, home, plain = map(np.array, zip(*entries, strict=True))
+    if _latitude_first(places, home, plain):
+        places[plain, :2] = places[plain, 1::-1]
     heights = next((kind for kind in _HEIGHTS if kind in kinds), "height")
     position = from_first_fix(_geodetic(places), above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
+    if position is None and np.isfinite(places[:, 0]).any():  # the Mavic 2 writes no height
+        position = from_first_fix(_geodetic(np.column_stack([places[:, :2], np.zeros(len(places))])))
+        lacks = [LogLack(Lack.HEIGHT_UNKNOWN)]
     real_s, shown_s = clock_s[-1] - clock_s[0], float(stamps[-1] - stamps[0]) * 1e-9
     if 1 < real_s < shown_s / 1.5:  # a second or more, and no rounding of the dates
         lacks.append(LogLack(Lack.SLOW, f"{shown_s / real_s:.1f}"))
     steady = _lens(lens)
     if steady is None:
-        lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(np.nanprod(lens, axis=1)):.0f} mm" for f in (np.min, np.max))))
+        seen = lens[:, 2] if np.isfinite(lens[:, 2]).any() else np.nanprod(lens[:, :2], axis=1)
+        unit = "deg" if np.isfinite(lens[:, 2]).any() else "mm"
+        lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(seen):.0f} {unit}" for f in (np.nanmin, np.nanmax))))
     attitudes = {"orientation": dji_attitude(body), "gimbal": dji_attitude(gimbal)}
     log = make_log(path, "DJI subtitles", stamps, lacks, position=position, **attitudes)
     return log._replace(video_clock=True, lens=steady)
@@ -93,8 +113,26 @@ def _entries(path: Path) -> list[_Entry]:
     found = (_entry(stamp_ns, text) for stamp_ns, text in read(path))
     entries = list(itertools.islice(filter(None, found), MAX_FRAMES + 1))
     if not 0 < len(entries) <= MAX_FRAMES:
-        raise InputError(f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}")
+        words = f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}"
+        raise InputError(words if entries else f"{words}; some models, as the Mavic Air, write none: use a flight log")
     return entries
+
+
+def _latitude_first(places: np.ndarray, home: np.ndarray, plain: np.ndarray) -> bool:
+    """Whether plain pairs, taken as longitude and latitude, are the other way round.
+
+    A latitude is below 90 degrees, and the distance from take-off fits one order.
+    """
+    latitude, longitude = places[plain, :2].T
+    if (np.abs(latitude) > 90).any():
+        return bool((np.abs(longitude) <= 90).all())
+    east, north = longitude - home[plain, 0], latitude - home[plain, 1]
+    off = [
+        np.abs(_METRES_PER_DEG * np.hypot(dx * np.cos(np.deg2rad(at)), dy) - home[plain, 2])
+        for dx, dy, at in ((east, north, latitude), (north, east, longitude))
+    ]
+    as_is, turned = (float(np.nansum(errors)) for errors in off)
+    return turned < 0.5 * as_is
 
 
 def _geodetic(places: np.ndarray) -> np.ndarray:
@@ -143,11 +181,13 @@ def _entry(stamp_ns: int, text: str) -> _Entry | None:
         if "yaw" in found and "pitch" in found:
             angles[of] = (found["pitch"], found.get("roll", 0.0), found["yaw"])
     kind = next((name for name in _HEIGHTS if name in values), "")
-    if not kind and not angles:
+    if not kind and not angles and "latitude" not in values:
         return None
     place = (values.get("latitude", math.nan), values.get("longitude", math.nan), values.get(kind, math.nan))
     gimbal, body = (angles.get(of, _UNKNOWN) for of in "GF")
-    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text))
+    way = _DISTANCE.search(text)
+    home = (float(way[1]), float(way[2]), float(way[3])) if way else _UNKNOWN
+    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text), home, "plain" in values)
 
 
 def _values(text: str) -> dict[str, float]:
@@ -160,7 +200,10 @@ def _values(text: str) -> dict[str, float]:
         latitude_first = gps[1].upper() in ("N", "S") if gps[1] else gps[6]
         names = ("latitude", "longitude") if latitude_first else ("longitude", "latitude")
         values |= {names[0]: _coordinate(gps[1], gps[2]), names[1]: _coordinate(gps[3], gps[4])}
-        values["altitude"] = float(gps[5])
+        if gps[6] or "." in gps[5]:  # else the number of satellites
+            values["altitude"] = float(gps[5])
+        if not gps[1] and not gps[6]:
+            values["plain"] = 1.0
     if barometer := _BAROMETER.search(text):
         values["barometer"] = float(barometer[1] or barometer[2])
     return values
@@ -176,23 +219,27 @@ def _clock_s(text: str) -> float:
     return 3600 * int(found[1]) + 60 * int(found[2]) + float(found[3].replace(",", ".")) if found else math.nan
 
 
-def _focal(text: str) -> tuple[float, float]:
-    """35 mm equivalent in mm and digital zoom, NaN and 1 where the subtitle has none."""
+def _focal(text: str) -> tuple[float, float, float]:
+    """35 mm equivalent in mm, digital zoom and horizontal view in deg; NaN, 1 and NaN where the subtitle has none."""
     found = {name.lower(): number for name, number in _LENS.findall(text)}
-    focal, zoom = found.get("focal_len", "nan"), found.get("dzoom_ratio", "1")
+    focal, zoom, view = found.get("focal_len", "nan"), found.get("dzoom_ratio", "1"), _VIEW.search(text)
     # Without a decimal point they count tenths of a mm and ten thousandths.
     factor = 1.0 if "." in zoom or float(zoom) < 100 else 1e-4
-    return float(focal) * (1.0 if "." in focal else 0.1), float(zoom) * factor
+    return float(focal) * (1.0 if "." in focal else 0.1), float(zoom) * factor, float(view[1]) if view else math.nan
 
 
 def _lens(values: np.ndarray) -> Lens | None:
-    """The lens of all subtitles (N, 2); the usual one where they state none; None where it changes."""
-    stated = values[(values[:, 0] >= 5) & (values[:, 0] <= 1000) & (values[:, 1] >= 1) & (values[:, 1] <= 100)]
+    """The lens of all subtitles (N, 3); the usual one where they state none; None where it changes."""
+    view = values[(values[:, 2] >= _VIEWS_DEG[0]) & (values[:, 2] <= _VIEWS_DEG[1]), 2]
+    stated = values[(values[:, 0] >= 5) & (values[:, 0] <= 1000) & (values[:, 1] >= 1) & (values[:, 1] <= 100), :2]
+    for each in (view[:, None], stated):
+        if len(each) and (np.ptp(each, axis=0) > 0.01 * np.median(each, axis=0)).any():
+            return None
+    if len(view):
+        return Lens.of_view(float(np.median(view)), "as the subtitles state")
     if not len(stated):
         return Lens()
     focal, zoom = np.median(stated, axis=0)
-    if (np.ptp(stated, axis=0) > 0.01 * np.array([focal, zoom])).any():
-        return None
     return Lens(float(focal), f"{focal:g} mm equivalent of the subtitles, full sensor width assumed", float(zoom))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
@@ -10,7 +11,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.telemetry.log import LogFormat, TelemetryLog, make_log
+from drocap_ros.recording.telemetry.log import LogFormat, LogLack, TelemetryLog, choose, make_log
 
 if TYPE_CHECKING:
     from pymavlink.dialects.v20.ardupilotmega import MAVLink_message
@@ -26,12 +27,23 @@ _MAGIC_V2 = 0xFD  # of MAVLink 2
 _CHUNK = 1 << 20
 
 
-def read_tlog(path: Path) -> TelemetryLog:
-    """Attitude, position and gimbal of the first autopilot in the log, by the ground station's clock."""
+#: MAVLink's numbers of messages with an attitude, of the body and of a mount.
+_ATTITUDES = (30, 31)
+_GIMBAL = 285  # GIMBAL_DEVICE_ATTITUDE_STATUS: each gimbal sends its own
+
+
+def read_tlog(path: Path, *, vehicle: str = "", mount: str = "") -> TelemetryLog:
+    """Attitude, position and gimbal of one autopilot in the log, by the ground station's clock.
+
+    vehicle, mount : MAVLink's system, and component of its gimbal; empty: those with most messages
+    """
     from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 
-    estimator, rows = VehicleStateEstimator(), []
+    system, component, lacks = _chosen(path, vehicle, mount)
+    estimator, rows = VehicleStateEstimator(system), []
     for message, received_ns in tlog_messages(path):
+        if message.get_type() == "GIMBAL_DEVICE_ATTITUDE_STATUS" and _gimbal_of(message) != component:
+            continue
         try:
             state = estimator.update(message, received_ns)
         except (ArithmeticError, ValueError):  # a damaged message that decodes nevertheless
@@ -41,8 +53,34 @@ def read_tlog(path: Path) -> TelemetryLog:
     if not rows:
         raise InputError(f"{path}: expected the attitude of an autopilot, found none; was ATTITUDE streamed?")
     stamps, position, body, gimbal = map(np.array, zip(*rows, strict=True))
-    log = make_log(path, "MAVLink tlog", stamps, [], orientation=body, position=position, gimbal=gimbal)
+    log = make_log(path, "MAVLink tlog", stamps, lacks, orientation=body, position=position, gimbal=gimbal)
     return log._replace(utc_minus_stamp_ns=0 if stamps[0] > _MIN_UTC_NS else None)
+
+
+def _chosen(path: Path, vehicle: str, mount: str) -> tuple[int, int, list[LogLack]]:
+    """System of the vehicle, 0 where none is known, component of its gimbal, and words on others."""
+    from drocap_ros.flight.mavlink.parser import MavlinkParser
+
+    attitudes, gimbals, parser = Counter[int](), Counter[tuple[int, int]](), MavlinkParser()
+    with path.open("rb") as file:
+        for _, packet in _packets(file):
+            newer = packet[0] == _MAGIC_V2
+            kind = int.from_bytes(packet[7:10] if newer else packet[5:6], "little")
+            if kind in _ATTITUDES:  # without the time that decoding takes
+                attitudes[packet[5 if newer else 3]] += 1
+            elif kind == _GIMBAL:
+                gimbals.update((message.get_srcSystem(), _gimbal_of(message)) for message in parser.feed(packet))
+    if not attitudes:
+        return 0, 0, []
+    system, lacks = choose(path, "vehicle", {str(s): n for s, n in sorted(attitudes.items())}, vehicle)
+    own = {str(gimbal): n for (of, gimbal), n in sorted(gimbals.items()) if str(of) == system}
+    component, more = choose(path, "mount", own, mount) if own or mount else ("0", [])
+    return int(system), int(component), lacks + more
+
+
+def _gimbal_of(message: MAVLink_message) -> int:
+    """Component of a gimbal, or the number under which an autopilot passes its messages on."""
+    return getattr(message, "gimbal_device_id", 0) or message.get_srcComponent()
 
 
 def tlog_messages(path: Path) -> Iterator[tuple[MAVLink_message, int]]:
@@ -88,4 +126,4 @@ def _packet_length(data: bytes, place: int) -> int | None:
     return length if len(data) >= place + 8 + length else None
 
 
-FORMAT = LogFormat(".tlog", read_tlog)
+FORMAT = LogFormat(".tlog", read_tlog, chooses=("vehicle", "mount"))

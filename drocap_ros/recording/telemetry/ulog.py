@@ -19,21 +19,27 @@ from drocap_ros.recording.telemetry.log import (
     LogLack,
     TelemetryLog,
     at_stamps,
+    choose,
     from_first_fix,
     make_log,
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from pyulog import ULog
 
 #: Fields of a topic by name, each (N,).
 _Data = dict[str, np.ndarray]
 
+#: Bytes before the first message; kinds of messages (https://docs.px4.io/main/en/dev_log/ulog_file_format.html).
+_HEAD_BYTES = 16
+_KINDS, _DATA = frozenset(bytes([kind]) for kind in b"FBIMPQARDLCSO"), ord("D")
+#: Messages that follow each other behind damage.
+_IN_TURN = 4
 _GPS = ("vehicle_gps_position", "sensor_gps")
-_TOPICS = (
-    *("vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "gimbal_device_attitude_status"),
-    *_GPS,
-)
+_GIMBAL = "gimbal_device_attitude_status"
+_TOPICS = ("vehicle_attitude", "vehicle_local_position", "vehicle_global_position", _GIMBAL, *_GPS)
 #: UTC in us from which a time is one of a GPS (2001).
 _EARLIEST_UTC_US = 1_000_000_000_000_000
 #: PX4's ``fix_type`` of a fix in three dimensions; more are better ones.
@@ -44,32 +50,88 @@ _YAW_IN_VEHICLE = 32  # bit of the flags, as the next
 _YAW_IN_EARTH = 64  # bit
 
 
-def read_ulog(path: Path) -> TelemetryLog:
-    """Attitude (``vehicle_attitude``), position and gimbal by time since power-up; UTC from the GPS."""
+def read_ulog(path: Path, *, mount: str = "") -> TelemetryLog:
+    """Attitude (``vehicle_attitude``), position and gimbal by time since power-up; UTC from the GPS.
+
+    mount : number of the gimbal's topic, from 0 on; empty: that with most states
+    """
     from pyulog import ULog
 
+    whole, damaged = _whole_messages(path.read_bytes())
     try:
         # pyulog prints remarks on damaged files.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            log = ULog(str(path), list(_TOPICS), disable_str_exceptions=True)
+            log = ULog(io.BytesIO(whole), list(_TOPICS), disable_str_exceptions=True)
     except Exception as error:  # noqa: BLE001  # pyulog passes on any error of its parser
         raise InputError(f"{path}: expected a PX4 ULog that can be read; {first_line(error)}") from None
     try:
-        return _to_log(path, log)
+        found = _to_log(path, log, mount)
     except (KeyError, IndexError, ValueError) as error:  # a damaged definition: fields are missing or of other types
         raise InputError(f"{path}: expected the fields of PX4's topics, found a damaged log ({error})") from None
+    if damaged or log.file_corruption:
+        found = found._replace(lacks=(*found.lacks, LogLack(Lack.DAMAGED, "states about the damage are missing")))
+    return found
 
 
-def _to_log(path: Path, ulog: ULog) -> TelemetryLog:
+def _whole_messages(data: bytes) -> tuple[bytes, bool]:
+    """A log without what lies between its whole messages, and whether there was any: pyulog ends at a wrong length.
+
+    Behind damage the next place counts from which some messages follow each other.
+    """
+    kept, lengths, damaged = [data[:_HEAD_BYTES]], dict[bytes, int](), False
+
+    def end_of(place: int) -> int:
+        """End of the message at a place, 0 where none stands there."""
+        size, end = int.from_bytes(data[place : place + 2], "little"), 0
+        if data[place + 2 : place + 3] in _KINDS and place + 3 + size <= len(data):
+            of_topic = lengths.get(data[place + 3 : place + 5], size) if data[place + 2] == _DATA else size
+            end = place + 3 + size if size == of_topic else 0
+        return end
+
+    place = _HEAD_BYTES
+    while place + 3 <= len(data):
+        end = end_of(place)
+        if not end:
+            damaged = True
+            place = next((p for p in range(place + 1, len(data)) if _follow(end_of, p, len(data))), len(data))
+            continue
+        if data[place + 2] == _DATA:
+            lengths.setdefault(data[place + 3 : place + 5], end - place - 3)
+        kept.append(data[place:end])
+        place = end
+    return b"".join(kept), damaged or place != len(data)
+
+
+def _follow(end_of: Callable[[int], int], place: int, end: int) -> bool:
+    """Whether messages follow each other from a place on, or to the end."""
+    for _ in range(_IN_TURN):
+        if place == end:
+            break
+        place = end_of(place)
+        if not place:
+            return False
+    return True
+
+
+def _to_log(path: Path, ulog: ULog, mount: str) -> TelemetryLog:
+    topics: dict[str, dict[str, _Data]] = {}
+    for data in sorted(ulog.data_list, key=lambda data: int(data.multi_id)):
+        if "timestamp" in data.data:
+            topics.setdefault(data.name, {})[str(data.multi_id)] = data.data
     series: dict[str, _Data] = {}
-    for data in ulog.data_list:
-        if "timestamp" in data.data and (data.multi_id == 0 or data.name not in series):
-            series[data.name] = data.data
+    lacks = [LogLack(Lack.DROPOUTS, str(len(ulog.dropouts)))] if ulog.dropouts else []
+    for name, instances in topics.items():
+        states = {number: len(data["timestamp"]) for number, data in instances.items()}
+        what, wanted = ("mount", mount) if name == _GIMBAL else (name, "")
+        number, more = choose(path, what, states, wanted)
+        series[name] = instances[number]
+        lacks += more if name == _GIMBAL else []
+    if mount and _GIMBAL not in topics:
+        raise InputError(f"{path}#{mount}: expected a log with mounts, found none; leave the choice out")
     attitude = series.get("vehicle_attitude")
     if attitude is None or not len(attitude["timestamp"]):
         raise InputError(f"{path}: expected vehicle_attitude in the ULog, found none; log it")
-    lacks = [LogLack(Lack.DROPOUTS, str(len(ulog.dropouts)))] if ulog.dropouts else []
     stamp_ns = _stamps(attitude)
     frd_to_ned = _quaternion(attitude, "q")
     position, position_lacks = _position(series, stamp_ns)
@@ -120,7 +182,7 @@ def _gps(data: _Data) -> np.ndarray | None:
 
 def _gimbal(series: dict[str, _Data], stamp_ns: np.ndarray, frd_to_ned: np.ndarray) -> np.ndarray | None:
     """(N, 4) camera FLU -> ENU; the yaw of a gimbal that follows the vehicle is relative to its nose."""
-    status = series.get("gimbal_device_attitude_status")
+    status = series.get(_GIMBAL)
     if status is None or not len(status["timestamp"]):
         return None
     camera = at_stamps(_stamps(status), _quaternion(status, "q"), stamp_ns, spherical=True)
@@ -155,4 +217,4 @@ def _quaternion(data: _Data, name: str) -> np.ndarray:
     return np.stack([np.asarray(data[f"{name}[{i}]"], np.float64) for i in (1, 2, 3, 0)], axis=1)
 
 
-FORMAT = LogFormat(".ulg", read_ulog, magic=b"ULog\x01\x12\x35")
+FORMAT = LogFormat(".ulg", read_ulog, magic=b"ULog\x01\x12\x35", chooses=("mount",))

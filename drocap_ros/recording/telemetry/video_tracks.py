@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -42,14 +43,19 @@ def read_samples(path: Path, number: int) -> Iterator[tuple[int, bytes]]:
 
 
 def stated_times(path: Path) -> tuple[int | None, float | None]:
-    """Creation time (UTC, ns) and duration (s) as the file states them, None where it does not."""
+    """Creation time (UTC, ns) and duration (s) as the file states them, None where it does not.
+
+    A time with its zone, as Apple writes it beside the other one, comes first.
+    """
     created_ns = duration_s = None
     with contextlib.suppress(pyav().error.FFmpegError), open_container(path) as container:
-        with contextlib.suppress(ValueError):
-            created = datetime.datetime.fromisoformat(
-                container.metadata.get("creation_time", "").replace("Z", "+00:00")
-            )
-            created_ns = round(created.timestamp()) * 10**9 if created.year in _YEARS else None
+        stated = (container.metadata.get(key, "") for key in ("com.apple.quicktime.creationdate", "creation_time"))
+        for text in stated:
+            with contextlib.suppress(ValueError):
+                zoned = re.sub(r"([+-]\d\d)(\d\d)$", r"\1:\2", text.replace("Z", "+00:00"))
+                created = datetime.datetime.fromisoformat(zoned)
+                if created_ns is None and created.tzinfo is not None and created.year in _YEARS:
+                    created_ns = round(created.timestamp()) * 10**9
         if container.duration and container.duration / 1e6 < _MAX_DURATION_S:
             duration_s = container.duration / 1e6
     return created_ns, duration_s

@@ -11,6 +11,7 @@ from test_sources import patch_box, write_video
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
+from drocap_ros.open_images import open_images
 from drocap_ros.perception.sources import SourceEventKind, open_source
 from drocap_ros.perception.sources.image_files import to_bgr
 
@@ -311,3 +312,31 @@ def test_damaged_heads_end_in_one_line(tmp_path):
                 assert len(list(source)) < 1000
         except InputError as error:
             assert "\n" not in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize("container", ["mp4", "mkv", "mov", "avi", "ts"])
+@pytest.mark.parametrize("sizes", [[(64, 48), (128, 96)], [(128, 96), (64, 48)], [(64, 48), (64, 64), (32, 32)]])
+def test_one_of_several_tracks_is_named_and_another_chosen(tmp_path, caplog, container, sizes):
+    path = tmp_path / f"two.{container}"
+    with av.open(str(path), "w") as output:
+        streams = []
+        for width, height in sizes:
+            streams.append(output.add_stream("mpeg4", rate=10))
+            streams[-1].width, streams[-1].height, streams[-1].pix_fmt = width, height, "yuv420p"
+        for i in range(8):
+            for stream in streams:
+                image = np.full((stream.height, stream.width, 3), 10 * i + 50, np.uint8)
+                output.mux(stream.encode(av.VideoFrame.from_ndarray(image, "bgr24")))
+        for stream in streams:
+            output.mux(stream.encode())
+    with open_images(path) as images:
+        assert next(iter(images.frames)).image.shape[1::-1] == max(sizes, key=lambda s: s[0] * s[1])
+    assert f"several video tracks, 1 ({sizes[0][0]}x{sizes[0][1]} px)" in caplog.text
+    for number, size in enumerate(sizes, 1):
+        with open_images(path, topic=str(number)) as images:
+            assert [f.image.shape[1::-1] for f in images.frames] == [size] * 8
+    with (
+        pytest.raises(InputError, match=f"expected a video track of .*, 1 to {len(sizes)}"),
+        open_images(path, topic="9"),
+    ):
+        pass

@@ -241,3 +241,19 @@ def test_an_unknown_distortion_model_is_refused(tmp_path: Path) -> None:
     path.write_text(f"{text}distortion_model: foo\n")
     with pytest.raises(InputError, match=r"distortion_model: expected one of plumb_bob, .* found 'foo'"):
         load_calibration(path)
+
+
+@pytest.mark.parametrize("damaged", [(0,), (3,), (2, 3, 5), (0, 1, 5), (5,)])
+@pytest.mark.parametrize("content", [b"", b"\xff\xd8\xff and then nothing", bytes(124)])
+def test_damaged_and_hidden_files_of_a_folder_are_gaps(tmp_path, damaged, content, caplog):
+    for i in range(6):
+        cv2.imwrite(str(tmp_path / f"walk_{i}.png"), np.full((10, 12, 3), i, np.uint8))
+        (tmp_path / f"._walk_{i}.png").write_bytes(bytes(124))  # as a Mac writes on other systems' disks
+    for i in damaged:
+        (tmp_path / f"walk_{i}.png").write_bytes(content)
+    with open_source(tmp_path, ImageIngestConfig(folder_rate_hz=10.0)) as source:
+        frames = list(source)
+    kept = [i for i in range(6) if i not in damaged]
+    assert [int(f.image[0, 0, 0]) for f in frames] == kept
+    assert [f.stamp_ns for f in frames] == [i * 100_000_000 for i in kept]
+    assert f"do not decode: {len(damaged)}, as walk_{damaged[0]}.png" in caplog.text

@@ -9,7 +9,7 @@ from telemetry_logs import mutated
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.recording.keypoints.files import read_keypoints
+from drocap_ros.recording.keypoints.files import Stated, read_keypoints
 from drocap_ros.skeleton import COCO_17
 from drocap_ros.tracks import load_tracks
 
@@ -107,6 +107,40 @@ def several_animals(folder, k, far):
     return text(folder / "walk_el.csv", "\n".join(";".join(map(str, row)) for row in head + body))
 
 
+def sleap(folder, k, far):
+    head = ["track", "frame_idx", "instance.score"] + [f"{n}.{a}" for n in COCO_17.joints for a in ("x", "y", "score")]
+    body = [[f"track_{w}", i, 0.9, *flat(p)] for i, both in enumerate(zip(k, far, strict=True))
+            for w, p in enumerate(both) if w == 0 or i > 2]  # fmt: skip
+    return text(folder / "sleap.csv", "\n".join(",".join(map(str, row)) for row in [head, *body]))
+
+
+def wide_table(folder, k, far):
+    head = ["frame"] + [f"{n}_{a}" for n in COCO_17.joints for a in ("x", "y", "z", "visibility")]
+    body = [[i, *(v for x, y, s in rows(p) for v in (x, y, -0.1, s))] for i, p in enumerate(k)]
+    return text(folder / "wide.csv", "\n".join(";".join(map(str, row)) for row in [head, *body]))
+
+
+def numbered_table(folder, k, far):
+    head = [f"{a}{n}" for n in range(17) for a in ("x", "y")]
+    return text(folder / "n.csv", "\n".join(",".join(map(str, row)) for row in [head, *(flat(p[:, :2]) for p in k)]))
+
+
+def long_table(folder, k, far):
+    body = [[i, n, *v] for i, p in enumerate(k) for n, v in zip(COCO_17.joints, rows(p), strict=True)]
+    return text(folder / "long.tsv", "\n".join("\t".join(map(str, row)) for row in
+                                               [["frame", "landmark", "x", "y", "confidence"], *body]))  # fmt: skip
+
+
+def unordered_ids(folder, k, far):
+    """COCO whose numbers of pictures are not in the order of time."""
+    numbers = np.random.default_rng(3).permutation(len(k)).tolist()
+    return write(folder / "cvat.json", {
+        "images": [{"id": n, "width": 1280, "height": 720, "file_name": f"walk_{i:06d}.jpg"}
+                   for n, i in sorted((n, i) for i, n in enumerate(numbers))],
+        "annotations": [{"id": n, "image_id": n, "keypoints": flat(p)} for n, p in zip(numbers, k, strict=True)],
+    })  # fmt: skip
+
+
 def with_scores(folder, k, far):
     np.savez(folder / "a.npz", keypoints=k, joints=COCO_17.joints, stamp_ns=np.arange(len(k)) * 10**9, image_size=SIZE)
     return folder / "a.npz"
@@ -132,7 +166,7 @@ def text(path, content):
 
 
 FORMS = [alphapose, cmu_form, openpose, mmpose, coco, named_points, columns, deeplabcut, several_animals,
-         with_scores, rate_only, bare_array]  # fmt: skip
+         sleap, wide_table, numbered_table, long_table, unordered_ids, with_scores, rate_only, bare_array]  # fmt: skip
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -140,7 +174,7 @@ def test_every_form_gives_the_same_tracks(tmp_path, form):
     k = walk()
     k[3, 9] = 0.0  # not seen, as COCO, OpenPose and AlphaPose write it
     far = walk() * [0.3, 0.3, 1.0] + [100, 100, 0]
-    found = read_keypoints(form(tmp_path, k, far), 15.0, SIZE)
+    found = read_keypoints(form(tmp_path, k, far), Stated(15.0, SIZE))
     assert found.joints == COCO_17.joints
     assert np.isnan(found.keypoints[3, 9]).all()
     seen = k[..., 2] > 0
@@ -174,7 +208,7 @@ def test_what_a_file_does_not_say_is_assumed_aloud(tmp_path, caplog):
 def test_frames_without_a_person_stay_frames(tmp_path):
     folder = openpose(tmp_path, walk(), walk())
     write(folder / "walk_000000000004_keypoints.json", {"people": []})
-    found = read_keypoints(folder, 15.0, SIZE)
+    found = read_keypoints(folder, Stated(15.0, SIZE))
     assert np.isnan(found.keypoints[4]).all()
     assert len(found) == 12
 
@@ -184,7 +218,7 @@ def test_shares_of_the_picture_need_its_size(tmp_path):
     np.save(tmp_path / "n.npy", k)
     with pytest.raises(InputError, match="--image-size"):
         read_keypoints(tmp_path / "n.npy")
-    assert read_keypoints(tmp_path / "n.npy", 15.0, SIZE).keypoints == pytest.approx(walk()[..., :2])
+    assert read_keypoints(tmp_path / "n.npy", Stated(15.0, SIZE)).keypoints == pytest.approx(walk()[..., :2])
 
 
 def test_zeros_and_places_outside_the_picture_are_not_seen(tmp_path, caplog):

@@ -229,7 +229,7 @@ def test_info_shows_model_rates_and_what_is_missing(video, tmp_path, capsys):
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert "source: DJI djmd track (Avata 2)" in lines
     assert "video track: MPEG-4 (mp4v), 320x180 px, 45 samples, 30.00/s" in lines
-    assert "missing: no gimbal or camera attitude in the log" in lines
+    assert "note: no gimbal or camera attitude in the log" in lines
     assert "aircraft attitude 45 100.0% 30.00/s" in lines
     (tmp_path / "v.mp4").write_bytes(video)
     assert main(["info", str(tmp_path / "v.mp4")]) == 0

@@ -9,7 +9,7 @@ import pytest
 from angles import angle_between
 from dataflash import write_dataflash
 from djmd_clips import plain_video
-from telemetry_logs import angles_of, dji_subtitle, mutated, srt_text, wrapped
+from telemetry_logs import angles_of, dji_subtitle, mutated, srt_text, with_track, wrapped
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
@@ -192,39 +192,14 @@ def test_every_spelling_of_subtitles_is_one_flight(tmp_path, place, angles, enco
     assert np.rad2deg(angles_of(track.orientation))[7] == pytest.approx([0.5, -3, 7], abs=1e-6)
 
 
-def with_text_track(video, lines, step_ms=100):
-    """The video with a subtitle track of 3GPP's timed text after its own tracks."""
-
-    def box(name, *parts):
-        data = b"".join(parts)
-        return struct.pack(">I4s", 8 + len(data), name) + data
-
-    samples = [struct.pack(">H", len(line.encode())) + line.encode() for line in lines]
-    data, count = video.read_bytes(), len(lines)
-    table = box(
-        b"stbl",
-        box(b"stsd", struct.pack(">II", 0, 1), box(b"tx3g", bytes(30))),
-        box(b"stts", struct.pack(">IIII", 0, 1, count, step_ms)),
-        box(b"stsc", struct.pack(">IIIII", 0, 1, 1, count, 1)),
-        box(b"stsz", struct.pack(">III", 0, 0, count), *(struct.pack(">I", len(s)) for s in samples)),
-        box(b"stco", struct.pack(">III", 0, 1, data.index(b"moov") - 4 + 8)),
-    )
-    media = box(b"mdia", box(b"mdhd", struct.pack(">IIIIIHH", 0, 0, 0, 1000, count * step_ms, 0, 0)),
-                box(b"hdlr", struct.pack(">II4s", 0, 0, b"sbtl"), bytes(13)), box(b"minf", table))  # fmt: skip
-    at = data.index(b"moov") - 4
-    length = struct.unpack_from(">I", data, at)[0]
-    assert at + length == len(data)
-    track = box(b"trak", media)
-    # The samples stand before the index, as the track's table of places says: after all that was there before it.
-    return data[:at] + box(b"mdat", *samples) + struct.pack(">I", length + len(track)) + data[at + 4 :] + track
-
-
 def test_subtitles_inside_a_video_are_read_as_those_beside_it(tmp_path, invented_flight, capsys):
     _, _, geodetic, mount = invented_flight
     lines = [dji_subtitle(i, g, m) for i, (g, m) in enumerate(zip(geodetic, mount, strict=True))]
     (tmp_path / "x.srt").write_text(srt_text(np.arange(len(lines)) * 0.1, lines))
     video = plain_video(tmp_path / "v.mp4", 10)
-    (tmp_path / "s.mp4").write_bytes(with_text_track(video, lines))
+    (tmp_path / "s.mp4").write_bytes(
+        with_track(video, [struct.pack(">H", len(line.encode())) + line.encode() for line in lines])
+    )
     inside, beside = read_telemetry(tmp_path / "s.mp4"), read_telemetry(tmp_path / "x.srt")
     assert np.array_equal(inside.track.stamp_ns, beside.track.stamp_ns)
     assert np.array_equal(inside.track.gimbal, beside.track.gimbal)
@@ -253,6 +228,18 @@ def test_zoom_during_a_clip_is_said(tmp_path, capsys):
     (tmp_path / "z.srt").write_text(srt_text(np.arange(25.0), lines))
     assert main(["info", str(tmp_path / "z.srt")]) == 0
     assert "the zoom changes (24 mm to 48 mm)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["fov_h", "hfov", "h_fov", "fovH", "horizontal_fov"])
+@pytest.mark.parametrize("degrees", [24.5, 66.0, 84.2])
+def test_a_field_of_view_in_subtitles_is_the_lens(tmp_path, name, degrees):
+    rows = ["[focal_len: 24.00] [rel_alt: 5.0] [gb_yaw: 1.0 gb_pitch: -9.0] [" + f"{name}: {{}}]"] * 20
+    (tmp_path / "v.srt").write_text(srt_text(np.arange(20.0), [row.format(degrees) for row in rows]))
+    assert read_telemetry(tmp_path / "v.srt").lens.horizontal_fov_deg((1920, 1080)) == pytest.approx(degrees)
+    (tmp_path / "z.srt").write_text(srt_text(np.arange(20.0), [r.format(degrees + i) for i, r in enumerate(rows)]))
+    log = read_telemetry(tmp_path / "z.srt")
+    assert log.lens is None
+    assert f"the zoom changes ({degrees:.0f} deg to" in str(log.lacks[-1])
 
 
 @pytest.mark.parametrize("name", ["x.tlog", "x.ulg", "x.bin", "x.srt", "x.txt"])

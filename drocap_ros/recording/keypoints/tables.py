@@ -1,0 +1,124 @@
+"""Tables of keypoints as JSON: DeepLabCut's, one row a person (SLEAP, MediaPipe), one row a point."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TypeAlias
+
+from drocap_ros.errors import InputError
+
+#: A frame, or a person in one.
+Frame: TypeAlias = "Mapping[str, object]"
+#: Characters of a line: whole bodies have some thousands.
+_LINE = 1 << 16
+#: Columns of a frame, a person and a point's name; "time" is no number of a frame.
+_FRAME = ("frame_idx", "frame_index", "frame_id", "frame", "image_id", "image", "img", "file_name", "image_name")
+_WHO = ("track", "track_id", "person_id", "person", "instance_id")
+_PART = ("landmark", "landmark_name", "keypoint", "keypoint_name", "joint", "joint_name", "bodypart", "name", "part")
+_AXIS = "x|y|z|score|confidence|conf|likelihood|visibility|v|c|p"
+#: A column's point and axis: ``nose_x`` or ``x_nose``, ``x0``.
+_COLUMN = re.compile(rf"(.+)[._\- ]({_AXIS})", re.IGNORECASE)
+_TURNED = re.compile(rf"({_AXIS})[._\- ]?(\d+|(?<=[._\- ]).+)", re.IGNORECASE)
+_SCORES = dict.fromkeys(("confidence", "conf", "likelihood", "visibility", "v", "c", "p"), "score")
+
+
+def is_keypoint_table(path: Path) -> bool:
+    """Whether the first line of a table is that of keypoints, and no flight log's."""
+    try:
+        return _kind(next(_rows(path), [])) is not None
+    except (OSError, UnicodeError, csv.Error):
+        return False
+
+
+def read_table(path: Path) -> Iterator[Frame]:
+    """Frames, or rows, as the JSON of a person in a frame."""
+    rows = _rows(path)
+    first = next(rows, [])
+    read = _kind(first)
+    if read is None:
+        raise InputError("expected a table of keypoints: DeepLabCut's, or columns as nose_x, nose_y; found another")
+    return read(itertools.chain([first], rows))
+
+
+def _rows(path: Path) -> Iterator[list[str]]:
+    with path.open("r", encoding="utf-8-sig", errors="replace", newline="") as file:
+        first = file.readline(_LINE)
+        lines = itertools.chain([first], iter(lambda: file.readline(_LINE), ""))
+        for row in csv.reader(lines, delimiter=max(",;\t", key=first.count)):
+            if row:
+                yield [cell.strip() for cell in row]
+
+
+def _kind(head: list[str]) -> Callable[[Iterator[list[str]]], Iterator[Frame]] | None:
+    names = [name.lower() for name in head]
+    if names[:1] in (["scorer"], ["bodyparts"]):
+        return _deeplabcut
+    if len(_columns(head)) >= 5:
+        return _wide
+    if {"x", "y"} <= set(names) and set(names) & set(_PART) and set(names) & set(_FRAME):
+        return _long
+    return None
+
+
+def _columns(head: list[str]) -> dict[str, dict[str, int]]:
+    """Columns of each point that has both coordinates."""
+    found: dict[str, dict[str, int]] = {}
+    for i, name in enumerate(head):
+        if (match := _COLUMN.fullmatch(name)) is not None:
+            point, axis = match.groups()
+        elif (match := _TURNED.fullmatch(name)) is not None:
+            axis, point = match.groups()
+        if match is not None:
+            found.setdefault(point, {}).setdefault(_SCORES.get(axis.lower(), axis.lower()), i)
+    return {name: columns for name, columns in found.items() if {"x", "y"} <= columns.keys()}
+
+
+def _place(head: list[str], names: tuple[str, ...]) -> int | None:
+    lower = [name.lower() for name in head]
+    return next((lower.index(name) for name in names if name in lower), None)
+
+
+def _wide(rows: Iterator[list[str]]) -> Iterator[Frame]:
+    head = next(rows)
+    columns, frame, who = _columns(head), _place(head, _FRAME), _place(head, _WHO)
+    for number, row in enumerate(rows):
+        cells = [*row, *[""] * (len(head) - len(row))]
+        points = [{"name": name, **{axis: cells[i] for axis, i in of.items()}} for name, of in columns.items()]
+        person = {} if who is None or not cells[who] else {"person_id": cells[who]}
+        yield {"frame_id": number if frame is None else cells[frame], "people": [{**person, "keypoints": points}]}
+
+
+def _long(rows: Iterator[list[str]]) -> Iterator[Frame]:
+    head = next(rows)
+    frame, part, who = (_place(head, names) for names in (_FRAME, _PART, _WHO))
+    values = {_SCORES.get(n.lower(), n.lower()): i for i, n in enumerate(head) if re.fullmatch(_AXIS, n, re.IGNORECASE)}
+    assert frame is not None
+    assert part is not None
+    found: dict[tuple[str, str], list[Mapping[str, str]]] = {}
+    for row in rows:
+        cells = [*row, *[""] * (len(head) - len(row))]
+        person = "" if who is None or who == part else cells[who]
+        points = found.setdefault((cells[frame], person), [])
+        points.append({"name": cells[part], **{axis: cells[i] for axis, i in values.items()}})
+    for (number, person), points in found.items():
+        yield {"frame_id": number, "people": [{"person_id": person, "keypoints": points}]}
+
+
+def _deeplabcut(rows: Iterator[list[str]]) -> Iterator[Frame]:
+    """Rows that begin with scorer, individuals, bodyparts, coords; then one row a frame."""
+    first = list(itertools.islice(rows, 4))
+    head = {row[0]: row[1:] for row in first if not row[0].isdigit()}
+    if not {"bodyparts", "coords"} <= head.keys():
+        raise InputError("expected the rows bodyparts and coords of DeepLabCut, found others; export the CSV again")
+    whose = head.get("individuals", [""] * len(head["coords"]))
+    columns = list(zip(whose, head["bodyparts"], head["coords"], strict=False))
+    for row in itertools.chain(first[len(head) :], rows):
+        people: dict[str, dict[str, dict[str, str]]] = {}
+        for (who, part, coord), text in zip(columns, row[1:], strict=False):
+            people.setdefault(who, {}).setdefault(part, {"name": part})[coord] = text
+        persons = [{"person_id": who, "keypoints": list(parts.values())} for who, parts in people.items()]
+        yield {"frame_id": row[0], "people": persons}

@@ -1,0 +1,98 @@
+"""Positions of a GPX track (https://www.topografix.com/GPX/1/1), as apps and loggers write it."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+from xml.etree.ElementTree import ParseError, iterparse
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.recording.telemetry.log import (
+    Lack,
+    LogFormat,
+    LogLack,
+    Series,
+    TelemetryLog,
+    choose,
+    from_first_fix,
+    make_log,
+    plausible,
+)
+from drocap_ros.tracks import MAX_FRAMES
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+
+class _Point(NamedTuple):
+    """Time UTC ns; latitude, longitude deg and height m, NaN unknown."""
+
+    stamp_ns: int
+    place: tuple[float, float, float]
+
+
+def read_gpx(path: Path, *, track: str = "") -> TelemetryLog:
+    """Positions by UTC; a track of the file is one of several, from 1 on: the longest, unless ``track`` is wanted."""
+    tracks, damaged = _tracks(path)
+    if not tracks:
+        raise InputError(f"{path}: expected points with times in a GPX track, found none; export it with times")
+    number, lacks = choose(path, "track", {str(n): len(points) for n, points in tracks.items()}, track)
+    points = tracks[int(number)]
+    stamp_ns, place = np.array([p.stamp_ns for p in points]), np.array([p.place for p in points])
+    order = np.unique(stamp_ns, return_index=True)[1]
+    stamp_ns, place = stamp_ns[order], place[order]
+    if damaged:
+        lacks.append(LogLack(Lack.DAMAGED, "read up to the damage"))
+    if np.isnan(place[:, 2]).all():
+        place[:, 2] = 0.0
+        lacks.append(LogLack(Lack.HEIGHT_UNKNOWN))
+    unknown = np.full((len(place), 3), np.nan)
+    found, more = plausible(path, Series(stamp_ns, unknown, unknown, place))
+    lacks += [*more, LogLack(Lack.LOCAL_POSITION, "point")]
+    log = make_log(path, "GPX track", stamp_ns, lacks, position=from_first_fix(found.geodetic))
+    return log._replace(utc_minus_stamp_ns=0)
+
+
+def _tracks(path: Path) -> tuple[dict[int, list[_Point]], bool]:
+    """Points with a time by the number of their track, and whether the file ends in damage."""
+    found: dict[int, list[_Point]] = {}
+    number = count = 0
+    try:
+        with path.open("rb") as file:
+            if b"<!ENTITY" in file.read(4096):
+                raise InputError(f"{path}: expected a GPX file, found entities of XML; export it again")
+            file.seek(0)
+            for event, element in iterparse(file, ("start", "end")):
+                name = element.tag.rpartition("}")[2]
+                number += event == "start" and name == "trk"
+                if event == "end" and name in ("trkpt", "trkseg"):
+                    point = _point(element) if name == "trkpt" and count < MAX_FRAMES else None
+                    if point is not None:
+                        count += 1
+                        found.setdefault(number, []).append(point)
+                    element.clear()
+    except ParseError:
+        return found, True
+    return found, False
+
+
+def _point(element: Element) -> _Point | None:
+    values = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in element}
+    # Python 3.10 reads no Z, and no fractions of other than three or six digits.
+    text = re.sub(r"(\.\d{1,6})\d*", lambda m: m[1].ljust(7, "0"), values.get("time", "")).replace("Z", "+00:00")
+    try:
+        time = datetime.datetime.fromisoformat(text)
+        place = float(element.get("lat", "nan")), float(element.get("lon", "nan")), float(values.get("ele") or "nan")
+    except ValueError:
+        return None
+    time = time if time.tzinfo else time.replace(tzinfo=datetime.timezone.utc)
+    since = time - datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
+    return _Point(round(since / datetime.timedelta(microseconds=1)) * 1000, place) if math.isfinite(place[0]) else None
+
+
+FORMAT = LogFormat(".gpx", read_gpx, chooses=("track",))

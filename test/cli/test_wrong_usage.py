@@ -1,0 +1,89 @@
+"""Wrong usage: one line that says what was found and what to do, status 2, nothing written."""
+
+import numpy as np
+import pytest
+from refusals import refused
+
+from drocap_ros.skeleton import COCO_17
+
+FILES = {
+    "notes.txt": b"a man walks\n" * 30, "skier.jpg": b"\xff\xd8\xff\xe0" + bytes(300), "empty.mp4": b"",
+    "rig.fbx": b"Kaydara FBX Binary  \x00\x1a\x00" + bytes(100), "bag.db3.zstd": b"\x28\xb5\x2f\xfd" + bytes(80),
+    "clip.mp4": b"\x00\x00\x00\x18ftypmp42" + bytes(400), "table.csv": b"a,b\n1,2\n", "one.mcap": b"\x89MCAP0\r\n",
+    "odd.json": b'{"a": [1, 2]}', "log.tlog": bytes(500), "x.srt": b"1\n", "lens.yaml": b"a: 1\n",
+}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name, content in FILES.items():
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "nothing").mkdir()
+    np.savez(tmp_path / "other.npz", a=np.zeros(3), b=np.zeros(3))
+    points = np.random.default_rng(0).uniform(0, 600, (30, 17, 2))
+    arrays = {"stamp_ns": np.arange(30) * 10**8, "image_size": (640, 480), "joints": COCO_17.joints}
+    np.savez(tmp_path / "tracks.npz", keypoints=points, **arrays)
+    np.savez(tmp_path / "shares.npz", keypoints=points / 640, **arrays)
+    np.savez(tmp_path / "solid.npz", keypoints=np.random.default_rng(0).normal(0, 1, (30, 17, 3)), **arrays)
+    np.save(tmp_path / "k.npy", points)
+    np.save(tmp_path / "flat.npy", np.zeros((30, 17)))
+    np.save(tmp_path / "middle.npy", points / 300 - 1)
+    np.savez(tmp_path / "mocap.npz", X=np.zeros((5, 17, 3)), joints=COCO_17.joints)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    ("reconstruct missing.mp4", "found no such file or folder"),
+    ("reconstruct https://a.example/clip.mp4", "https://a.example/clip.mp4: expected"),
+    ("info https://a.example/clip.mp4", "download the file and name it"),
+    ("info rtsp://10.0.0.2:8554/live", "rtsp://10.0.0.2:8554/live: expected"),
+    ("reconstruct notes.txt --models simulation", "found text"),
+    ("reconstruct empty.mp4 --models simulation", "found 0 bytes"),
+    ("reconstruct clip.mp4 --models simulation", "without a readable header or index"),
+    ("reconstruct rig.fbx --models simulation", "expected a video file"),
+    ("reconstruct bag.db3.zstd --models simulation", "unpack it: zstd -d"),
+    ("reconstruct nothing --models simulation", "expected a folder with images"),
+    ("reconstruct other.npz", "expected 2D keypoints of a person, found none"),
+    ("reconstruct shares.npz", "multiply normalised ones"),
+    ("reconstruct solid.npz", "as of 3D poses"),
+    ("reconstruct flat.npy", "expected 2D keypoints of a person, found none"),
+    ("reconstruct middle.npy", "about a middle"),
+    ("reconstruct k.npy", "--order NAME, of coco17, h36m17"),
+    ("reconstruct k.npy --order", "expected one argument"),
+    ("reconstruct k.npy --order openpose", "expected an order of 17 points"),
+    ("reconstruct tracks.npz --order h37m", "expected an order of 17 points"),
+    ("reconstruct clip.mp4 --order coco17", "expected a file of 2D keypoints"),
+    ("reconstruct k.npy --image-size 640", "expected width and height"),
+    ("reconstruct k.npy --rate fast", "expected images per second"),
+    ("reconstruct odd.json", "expected 2D keypoints of a person, found none"),
+    ("reconstruct table.csv", "found a telemetry log"),
+    ("reconstruct log.tlog", "found a telemetry log"),
+    ("reconstruct tracks.npz --telemetry log.tlog", "expected a video"),
+    ("reconstruct clip.mp4 --telemetry missing.ulg", "expected a log, found no such file"),
+    ("reconstruct clip.mp4 --telemetry log.tlog --models simulation", "expected a MAVLink telemetry log"),
+    ("reconstruct clip.mp4 --telemetry x.srt#2 --models simulation", "expected no choice after this log's name"),
+    ("reconstruct clip.mp4 --start -1", "--start"), ("reconstruct clip.mp4 --start 5 --end 3", "--end"),
+    ("reconstruct clip.mp4 --time-offset 3", "expected --telemetry LOG"),
+    ("reconstruct tracks.npz --height 17", "expected 0.5 to 2.5"),
+    ("reconstruct tracks.npz --fov 5000", "expected 5 to"),
+    ("reconstruct tracks.npz --calibration lens.yaml", "expected image_width"),
+    ("reconstruct tracks.npz --subject 2", "found 2D tracks of one person"),
+    ("reconstruct tracks.npz --topic 1", "expected images"), ("reconstruct tracks.npz --metod ba", "--method"),
+    ("reconstruct tracks.npz --method baa", "invalid choice"),
+    ("reconstruct tracks.npz --evidence other.npz", "expected"),
+    ("reconstruct tracks.npz tracks.npz", "add --together"),
+    ("reconstruct tracks.npz --together", "expected two INPUTs"),
+    ("track k.npy", "`drocap reconstruct"), ("track odd.json", "found 2D keypoints"), ("track tracks.npz", "expected"),
+    ("track clip.mp4 --topic 1 --models simulation", "without a readable header"),
+    ("track nothing --topic /a --models simulation", "leave the option out"),
+    ("info notes.txt", "found text"), ("info skier.jpg", "found an image"), ("info clip.mp4", "expected a video file"),
+    ("track one.mcap --models simulation", "found no topics"), ("info nothing", "found a folder without one"),
+    ("info x.srt", "expected 1 to"), ("info x.srt.gz", "no such file"), ("info mocap.npz", "expected"),
+    ("report skier.jpg", "found an image"), ("report other.npz", "found an archive of other arrays (a, b)"),
+    ("export other.npz --to bvh", "expected a motion, found"), ("export notes.txt --to bvh", "found text"),
+    ("evaluate compare notes.txt notes.txt", "found text"), ("view skier.jpg", "expected"),
+    ("recover skier.jpg", "found another kind of file"), ("batch missing*.mp4 --out out", "found none"),
+])  # fmt: skip
+def test_wrong_usage_is_one_line_and_status_2(folder, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(folder)
+    refused(words.split(), folder, capsys, said)

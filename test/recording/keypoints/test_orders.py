@@ -1,0 +1,108 @@
+"""The order of keypoints: stated by names, found by the body, or refused; inputs that are no body are never good."""
+
+import numpy as np
+import pytest
+from orders_of_points import SIZE, in_order, views, wrong_inputs
+
+from drocap_ros.cli import main
+from drocap_ros.errors import InputError
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.recording.keypoints.body_check import is_no_body, limbs_of
+from drocap_ros.recording.keypoints.files import Stated, read_keypoints
+from drocap_ros.recording.keypoints.orders import ORDERS, joint_name
+from drocap_ros.report.checks import quality_sentence, run_checks
+from drocap_ros.report.statistics import motion_statistics
+
+ACTIONS = ("walk", "boxing", "kicking", "squats", "mixed")
+
+
+@pytest.mark.parametrize("order", [name for name in ORDERS if name not in ("wholebody133", "halpe136")])
+@pytest.mark.parametrize("seed", range(3))
+def test_every_order_is_found_by_its_body(tmp_path, order, seed, caplog):
+    rng = np.random.default_rng(seed)
+    points = in_order(views(ACTIONS[seed], seed, height_m=1.5 + 2 * seed, start_deg=100 * seed)[2], order, rng)
+    np.save(tmp_path / "k.npy", points)
+    found = read_keypoints(tmp_path / "k.npy", Stated(30.0, SIZE))
+    wanted, got = limbs_of(ORDERS[order]), limbs_of(found.joints)
+    assert all(got[joint] == at for joint, at in wanted.items() if joint != "face")
+    assert "points without names: taken in the order" in caplog.text
+
+
+WRONG = list(wrong_inputs())
+
+
+def test_there_are_sixty_wrong_inputs():
+    assert len(WRONG) >= 60
+
+
+@pytest.mark.parametrize(("name", "arrays"), WRONG, ids=[name for name, _ in WRONG])
+def test_what_is_no_body_is_refused_or_doubted(tmp_path, name, arrays):
+    np.savez(tmp_path / "k.npz", **arrays)
+    size = SIZE if "without a size" not in name else None
+    try:
+        tracks = read_keypoints(tmp_path / "k.npz", Stated(30.0, size))
+    except InputError:
+        return
+    motion = reconstruct(tracks)
+    assert "quality: doubtful" in quality_sentence(run_checks(motion, motion_statistics(motion)))
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+@pytest.mark.parametrize("seed", range(4))
+def test_a_body_is_not_doubted(action, seed):
+    rng = np.random.default_rng(seed)
+    points = in_order(views(action, seed, height_m=1 + 1.3 * seed, start_deg=70 * seed)[2], "coco17", rng, 2.0)
+    points[rng.random(points.shape[:2]) < 0.2] = np.nan
+    assert not is_no_body(points, ORDERS["coco17"], strict=True)
+
+
+def test_an_order_that_a_user_states_replaces_names_and_the_search(tmp_path, capsys):
+    points = in_order(views()[2], "h36m17", np.random.default_rng(0))
+    np.savez(tmp_path / "k.npz", keypoints=points, joints=ORDERS["coco17"])
+    assert read_keypoints(tmp_path / "k.npz", Stated(30.0, SIZE, "h36m")).joints == ORDERS["h36m17"]
+    arrays = {"joints": ORDERS["coco17"], "stamp_ns": np.arange(len(points)) * 10**8, "image_size": SIZE}
+    np.savez(tmp_path / "own.npz", keypoints=points, **arrays)
+    assert read_keypoints(tmp_path / "own.npz", Stated(order="h36m17")).joints == ORDERS["h36m17"]
+    assert main(["reconstruct", str(tmp_path / "k.npz"), "--order", "openpose25"]) == 2
+    assert "expected an order of 17 points (coco17, h36m17" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("key", "names"),
+    [
+        ("keypoint_names", list),
+        ("joint_names", list),
+        ("keypoint_id2name", lambda names: {str(i): name for i, name in enumerate(names)}),
+        ("keypoint_name2id", lambda names: {name: i for i, name in enumerate(names)}),
+    ],
+)
+def test_names_beside_the_points_win(tmp_path, key, names):
+    import json
+
+    human36m = ["root", *(f"{side}_{part}" for side in ("right", "left") for part in ("hip", "knee", "foot")), "spine",
+                "thorax", "neck_base", "head"]  # fmt: skip
+    human36m += [f"{side}_{part}" for side in ("left", "right") for part in ("shoulder", "elbow", "wrist")]
+    points = in_order(views()[2], "h36m17", np.random.default_rng(0)).tolist()
+    frames = [{"frame_id": i, "instances": [{"keypoints": person}]} for i, person in enumerate(points)]
+    (tmp_path / "k.json").write_text(json.dumps({"meta_info": {key: names(human36m)}, "instance_info": frames}))
+    assert read_keypoints(tmp_path / "k.json").joints == ORDERS["h36m17"]
+
+
+def test_spellings_of_a_joint():
+    for name in ("RHip", "hip_R", "Hip.right", "rightHip", "right-hip", "r_hip"):
+        assert joint_name(name) == "right_hip"
+    assert joint_name("left_foot_index") == "left_big_toe"
+
+
+@pytest.mark.parametrize("seen", ["upper body", "without ankles", "left side half", "one frame"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_part_of_a_body_is_not_doubted(seen, seed):
+    rng = np.random.default_rng(seed)
+    points = in_order(views(ACTIONS[seed], seed, start_deg=80 * seed)[2], "coco17", rng, 2.0)
+    if seen == "one frame":
+        points = points[40:41]
+    elif seen == "left side half":
+        points[::2, 1::2] = np.nan
+    else:
+        points[:, 11 if seen == "upper body" else 15 :] = np.nan
+    assert not is_no_body(points, ORDERS["coco17"], strict=True)
