@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from drocap_ros.perception.detection.nms import iou
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.pose.body_pose import BodyPose
 from drocap_ros.perception.tracking.appearance import difference
-from drocap_ros.perception.tracking.person import Person
 from drocap_ros.skeleton import BODY_15, JointSet
 
 _ERROR = 0.05  # of an expected joint at once, lengths: networks err by 0.02, and persons are not steady
@@ -25,23 +24,24 @@ _LONGEST_S = 1.0  # over which it grows
 _RATE = 0.6  # weight of a new speed
 _DECAY_S = 0.3  # time in which a speed without measurement falls to a third
 _MARGIN = 0.06  # of the box around the joints, as of a pose's own box
-_SAME_BOX = 0.4  # overlap from which a detection is this person's
 _LENGTH_RATE = 0.1  # weight of a new length
 _COLOUR_RATE = 0.1  # and of a new colour
 
 
-class BodyTrack:
-    """One person: identity and look in ``person``, joints (P, 2) px as expected in the image of ``stamp_ns``.
+class ExpectedJoints:
+    """Joints (P, 2) px of a person as expected in the image of ``stamp_ns``, from those of a pose on.
 
     colours : (P, 3) L a b of the limbs that end at the joints, NaN = unknown
     length : px, usual longer side of the box around the joints
     joints_ns : (P,) when each joint was last this person's; seen_ns : when enough of them were
     detected_ns : last detection of the whole image on this person
+    seen : the observation of the newest image in which joints were this person's
     """
 
-    def __init__(self, person: Person, pose: BodyPose, joints: JointSet, stamp_ns: int) -> None:
-        self.person, self.joint_set = person, joints
+    def __init__(self, pose: BodyPose, joints: JointSet, stamp_ns: int) -> None:
+        self.joint_set = joints
         self.stamp_ns = self.seen_ns = self.detected_ns = stamp_ns
+        self.seen: PoseObservation | None = None
         self.xy: np.ndarray = pose.xy.astype(float)
         self.speed = np.zeros_like(self.xy)  # px/s
         self.joints_ns = np.full(len(joints), stamp_ns)
@@ -50,6 +50,10 @@ class BodyTrack:
         self.length = max(float((box[2:] - box[:2]).max()), 1.0)
         names = [name.lstrip("lr") for name in joints.joints]
         self._per_s = np.array([_ERROR_PER_S.get(name, _TRUNK_PER_S) for name in names])
+
+    def seen_in(self, stamp_ns: int) -> PoseObservation | None:
+        """The observation of the image of this stamp; None where it shows no joints of this person."""
+        return self.seen if self.seen is not None and self.seen.stamp_ns == stamp_ns else None
 
     def predict(self, stamp_ns: int) -> None:
         """Expect the joints at a later time; a long gap between images is a time without measurement, too."""
@@ -63,7 +67,6 @@ class BodyTrack:
     def move_camera(self, matrix: np.ndarray) -> None:
         """Follow the image's motion (2, 3) by the camera's."""
         self.xy = self.xy @ matrix[:, :2].T + matrix[:, 2]
-        self.person.move_camera(matrix)
 
     @property
     def reach(self) -> np.ndarray:
@@ -77,14 +80,6 @@ class BodyTrack:
         low, high = self.xy.min(axis=0), self.xy.max(axis=0)
         margin = _MARGIN * float((high - low).max())
         return np.concatenate([low - margin, high + margin])
-
-    def overlap(self, box: np.ndarray) -> float:
-        """Intersection over union with a box (4,) px."""
-        return float(iou(box[None].astype(float), self.box[None])[0, 0])
-
-    def on(self, box: np.ndarray) -> bool:
-        """Whether a box (4,) px may be this person's."""
-        return self.overlap(box) > _SAME_BOX
 
     def accept(self, xy: np.ndarray, own: np.ndarray, believed: bool) -> None:
         """Take over those measured joints (P, 2) px of the image that are this person's, (P,) bool."""
@@ -110,13 +105,9 @@ class BodyTrack:
         self.colours[first] = colours[first]
         self.colours += _COLOUR_RATE * np.nan_to_num(colours - self.colours) * free[:, None]
 
-    def continue_as(self, found: BodyTrack) -> None:
-        """Go on with the joints of a new track in which this lost person was found again."""
-        found.person.continue_as(self.person)
-        self.person, self.xy, self.speed, self.joints_ns = found.person, found.xy, found.speed, found.joints_ns
-        self.stamp_ns, self.seen_ns, self.detected_ns = found.stamp_ns, found.seen_ns, found.detected_ns
-        self.length = found.length
-        self.colours = np.where(np.isnan(self.colours), found.colours, self.colours)
+    def keep_look(self, before: ExpectedJoints) -> None:
+        """Take over the known colours of the joints of an earlier track."""
+        self.colours = np.where(np.isnan(before.colours), self.colours, before.colours)
 
 
 _ONE_PLACE = 0.08  # distance of joints that may be one, lengths of the body
@@ -188,7 +179,7 @@ class Owned(NamedTuple):
     joint: np.ndarray
 
 
-def own_joints(tracks: Sequence[BodyTrack], poses: Poses) -> Owned:
+def own_joints(tracks: Sequence[ExpectedJoints], poses: Poses) -> Owned:
     """The joints of overlapping bodies, of the poses in the boxes where each was expected."""
     body = _bodies(tracks, poses)
     count = len(BODY_15)
@@ -212,20 +203,20 @@ def _of(poses: Poses, joint: np.ndarray) -> np.ndarray:
     return xy
 
 
-def _look(track: BodyTrack, colours: np.ndarray) -> np.ndarray:
+def _look(track: ExpectedJoints, colours: np.ndarray) -> np.ndarray:
     """(P,) how unlikely colours (P, 3) are on the body's limbs."""
     off = np.nan_to_num(difference(colours, track.colours), nan=1.0)
     return np.asarray(0.5 * np.minimum(off, _FAR) ** 2)
 
 
-def _cost(track: BodyTrack, xy: np.ndarray) -> np.ndarray:
+def _cost(track: ExpectedJoints, xy: np.ndarray) -> np.ndarray:
     """(..., P) how unlikely places (..., P, 2) px are of the body's joints: of a Gauss about the expected ones."""
     reach = track.reach
     off = np.linalg.norm(xy - track.xy, axis=-1) / reach
     return np.asarray(0.5 * np.minimum(off, _FAR) ** 2 + 2.0 * np.log(reach / reach.min()) * 0.25)
 
 
-def _bodies(tracks: Sequence[BodyTrack], poses: Poses) -> np.ndarray:
+def _bodies(tracks: Sequence[ExpectedJoints], poses: Poses) -> np.ndarray:
     """(N,) index of the pose of each body, -1 = none: two boxes may have given the same body."""
     count = len(BODY_15)
     cost = np.full((len(tracks), 2 * len(tracks)), _DROP_BODY)
@@ -235,8 +226,7 @@ def _bodies(tracks: Sequence[BodyTrack], poses: Poses) -> np.ndarray:
             cost[:, i] = 2 * _DROP_BODY
             continue
         for k, track in enumerate(tracks):
-            exchanged = _cost(track, poses.xy[i][_exchanged(track)])
-            each = np.minimum(_cost(track, poses.xy[i]), exchanged)
+            each = np.minimum(_cost(track, poses.xy[i]), _cost(track, poses.xy[i][track.joint_set.mirror]))
             cost[k, i] = float((each + _look(track, poses.colours[i]))[:count][seen].mean()) + _age_cost(track)
     rows, columns = linear_sum_assignment(cost)
     found = np.full(len(tracks), -1)
@@ -244,16 +234,12 @@ def _bodies(tracks: Sequence[BodyTrack], poses: Poses) -> np.ndarray:
     return found
 
 
-def _exchanged(track: BodyTrack) -> np.ndarray:
-    return track.joint_set.mirror
-
-
-def _age_cost(track: BodyTrack) -> float:
+def _age_cost(track: ExpectedJoints) -> float:
     """A body unseen for long has no claim on what another one explains as well."""
     return min((track.stamp_ns - track.seen_ns) * 1e-9, 1.0)
 
 
-def _given_before(tracks: Sequence[BodyTrack], poses: Poses, i: int) -> bool:
+def _given_before(tracks: Sequence[ExpectedJoints], poses: Poses, i: int) -> bool:
     """Whether another box gave the same body with more confidence."""
     count = len(BODY_15)
     for other in range(len(tracks)):
@@ -269,7 +255,7 @@ def _given_before(tracks: Sequence[BodyTrack], poses: Poses, i: int) -> bool:
     return False
 
 
-def _joint(tracks: Sequence[BodyTrack], poses: Poses, body: np.ndarray, j: int) -> np.ndarray:
+def _joint(tracks: Sequence[ExpectedJoints], poses: Poses, body: np.ndarray, j: int) -> np.ndarray:
     """(N,) index of the pose whose joint ``j`` is each body's, its own or -1 = none."""
     result = body.copy()
     for k, i in enumerate(body):
@@ -279,7 +265,7 @@ def _joint(tracks: Sequence[BodyTrack], poses: Poses, body: np.ndarray, j: int) 
     return _once(tracks, poses, result, j)
 
 
-def _once(tracks: Sequence[BodyTrack], poses: Poses, result: np.ndarray, j: int) -> np.ndarray:
+def _once(tracks: Sequence[ExpectedJoints], poses: Poses, result: np.ndarray, j: int) -> np.ndarray:
     """The same where two bodies claim one place: it is the nearer one's, and nobody's where neither is so clearly."""
     for a in range(len(tracks)):
         for b in range(a + 1, len(tracks)):
@@ -297,7 +283,7 @@ def _once(tracks: Sequence[BodyTrack], poses: Poses, result: np.ndarray, j: int)
     return result
 
 
-def _mixed(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndarray) -> np.ndarray:
+def _mixed(track: ExpectedJoints, others: Sequence[ExpectedJoints], xy: np.ndarray) -> np.ndarray:
     """(15,) bool: joints (15, 2) px off their expected places, or unseen for long, where another body's may be."""
     count = len(xy)
     own = np.linalg.norm(xy - track.xy[:count], axis=1) / track.reach[:count]
@@ -312,7 +298,9 @@ def _mixed(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndarray) -> np.
     return mixed
 
 
-def _of_others_colour(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndarray, colours: np.ndarray) -> np.ndarray:
+def _of_others_colour(
+    track: ExpectedJoints, others: Sequence[ExpectedJoints], xy: np.ndarray, colours: np.ndarray
+) -> np.ndarray:
     """(15,) bool: joints (15, 2) px at the end of limbs whose colours (15, 3) are another body's, where it may be."""
     count = len(xy)
     own = np.nan_to_num(difference(colours, track.colours[:count]))
@@ -325,7 +313,7 @@ def _of_others_colour(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndar
     return found
 
 
-def _too_long(track: BodyTrack, xy: np.ndarray) -> np.ndarray:
+def _too_long(track: ExpectedJoints, xy: np.ndarray) -> np.ndarray:
     """(P,) bool: joints (P, 2) px at the end of a limb longer than a body's."""
     joints = track.joint_set
     parents = np.array(joints.parents)

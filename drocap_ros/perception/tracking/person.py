@@ -10,6 +10,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.tracking.camera_motion import moved_box
+from drocap_ros.perception.tracking.own_joints import ExpectedJoints
 
 #: Standard deviation of a measured box: centre in lengths, logarithm of the sizes.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
@@ -285,6 +286,7 @@ class Person:
     met_ns : last time at which its box overlapped the subject's, the subject's that of anybody
     recent : appearance in the last few images
     pose : what its poses say about it
+    joints : where its joints are expected, where everybody's are followed
     """
 
     def __init__(self, box: np.ndarray, score: float, stamp_ns: int, appearance: np.ndarray | None) -> None:
@@ -297,6 +299,7 @@ class Person:
         self.others: set[Person] = set()
         self.met_ns = stamp_ns - _LONG_AGO_NS
         self.pose = PoseBelief(box, stamp_ns)
+        self.joints: ExpectedJoints | None = None
         self.appearance = self.recent = appearance
         self._descriptors = 1 if appearance is not None else 0
 
@@ -353,6 +356,15 @@ class Person:
         self.mean_score += _RECENT_RATE * (score - self.mean_score)
         self.hits += 1
 
+    def measure(self, box: np.ndarray, stamp_ns: int) -> None:
+        """Confirm the person in the box (4,) px around its joints, in place of a detection of this image."""
+        if self.detected_ns == stamp_ns:
+            self.correct(box, self.score)
+        else:
+            self.filter.predict(stamp_ns)
+            self.update(box, self.score, stamp_ns)
+        self.confirm(stamp_ns)
+
     def remainder(self, stamp_ns: int) -> Person:
         """A track of what its box shows, which was found to be no person."""
         clutter = Person(self.box, self.score, stamp_ns, None)
@@ -365,12 +377,16 @@ class Person:
         self.box, self.pose.began = moved_box(matrix, self.box), moved_box(matrix, self.pose.began)
         if self.pose.box is not None:
             self.pose.box = moved_box(matrix, self.pose.box)
+        if self.joints is not None:
+            self.joints.move_camera(matrix)
 
     def continue_as(self, lost: Person) -> None:
         """Take over what is known of a lost person who was found again in this track."""
         if lost.appearance is not None:
             self.appearance, self._descriptors = lost.appearance, lost._descriptors
         self.others |= lost.others
+        if self.joints is not None and lost.joints is not None:
+            self.joints.keep_look(lost.joints)
 
     def confirm(self, stamp_ns: int) -> None:
         """Confirm the detection at this time."""

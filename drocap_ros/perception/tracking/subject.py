@@ -74,6 +74,8 @@ class SubjectTracker:
         self.subject: Person | None = None  # the last one, lost or not
         #: Lost subjects and their track ids, after whom the rule chose the next one: whoever comes back is it again.
         self._away: list[tuple[int, Person]] = []
+        #: Persons whose joints were followed, out of view.
+        self.lost: list[Person] = []
         self._track_id = self._last_id = 0
         self._is_shown = False
         #: The last changes of the subject, stamp and words; an exchange keeps the person and is none.
@@ -87,11 +89,11 @@ class SubjectTracker:
     def reset(self) -> None:
         """Delete all tracks, for stamps that restarted; track ids continue."""
         self.persons, self.subject, self.choice.nothing_yet, self._last_ns = [], None, True, None
-        self._away = []
+        self._away, self.lost = [], []
 
     def move_camera(self, matrix: np.ndarray) -> None:
         """Let all persons follow the image's motion (2, 3) by the camera's, those out of view as well."""
-        for person in (*self.persons, *(away for _, away in self._away)):
+        for person in (*self.persons, *self.lost, *(away for _, away in self._away)):
             person.move_camera(matrix)
 
     def followed(self, stamp_ns: int) -> Person | None:
@@ -389,10 +391,19 @@ class SubjectTracker:
         if subject is not None:
             subject.left_image = subject.undetected_s(stamp_ns) > 0 and (subject.left_image or _leaving(subject, shape))
             subject.others = {p for p in subject.others if p.undetected_s(stamp_ns) <= FORGET_S}
-        kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S]
+        here = boxes_of(self.detected(stamp_ns))
+        kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S or _behind(p, here)]
+        gone = [p for p in self.persons if p.joints is not None and p not in kept]
+        self.lost = [p for p in (*self.lost, *gone) if p.unconfirmed_s(stamp_ns) <= FORGET_S]
         if len(kept) > _MAX_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))
         self.persons = kept[:_MAX_PERSONS]
+
+
+def _behind(person: Person, others: np.ndarray) -> bool:
+    """Whether the joints of a person are expected behind somebody in boxes (N, 4) px, where they stay until then."""
+    joints = person.joints
+    return joints is not None and bool((overlap_coefficient(joints.box[None], others) > _APART).any())
 
 
 def _leaving(person: Person, image_shape: tuple[int, ...]) -> bool:

@@ -7,8 +7,7 @@ from people_scenes import PeopleScene, camera_of, people_of
 
 from drocap_ros.perception.pose.body_pose import BodyPose
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.tracking.own_joints import BodyTrack, Poses, contested, own_joints
-from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.own_joints import ExpectedJoints, Poses, contested, own_joints
 from drocap_ros.skeleton import BODY_15
 
 SCENE = PeopleScene("cross", 1)
@@ -22,13 +21,12 @@ def pose_of(xy: np.ndarray) -> BodyPose:
     return BodyPose(xy.astype(float), np.ones((15, 3)), np.full(15, 0.95), network)
 
 
-def tracks_up_to(frame: int, who: tuple[int, ...]) -> list[BodyTrack]:
+def tracks_up_to(frame: int, who: tuple[int, ...]) -> list[ExpectedJoints]:
     """Tracks that have seen every image before ``frame`` and expect the joints in it."""
     found = []
     for k in who:
         xy = TRUTH[k]
-        box = np.concatenate([xy[0].min(axis=0), xy[0].max(axis=0)])
-        track = BodyTrack(Person(box, 0.8, int(TIMES[0]), None), pose_of(xy[0]), BODY_15, int(TIMES[0]))
+        track = ExpectedJoints(pose_of(xy[0]), BODY_15, int(TIMES[0]))
         for i in range(1, frame):
             track.predict(int(TIMES[i]))
             track.accept(xy[i], np.ones(15, bool), believed=True)
@@ -90,17 +88,6 @@ def test_one_gap_is_as_long_as_many_images_without_the_person() -> None:
     left_out.predict(hidden.stamp_ns)
     apart = np.linalg.norm(left_out.xy - hidden.xy, axis=1)
     assert (apart < 0.15 * np.linalg.norm(hidden.xy - tracks_up_to(10, (0,))[0].xy, axis=1)).all()
-
-
-def test_length_is_that_of_the_joints_in_a_box_around_two_persons() -> None:
-    both = np.concatenate([TRUTH[0][0], TRUTH[1][0]])
-    one, two = (np.concatenate([xy.min(axis=0), xy.max(axis=0)]) for xy in (TRUTH[0][0], both))
-    assert np.ptp(two.reshape(2, 2), axis=0).max() > 1.5 * np.ptp(one.reshape(2, 2), axis=0).max()
-    alone, merged = (
-        BodyTrack(Person(box, 0.8, int(TIMES[0]), None), pose_of(TRUTH[0][0]), BODY_15, int(TIMES[0])).length
-        for box in (one, two)
-    )
-    assert merged == alone
 
 
 def test_images_before_and_after_show_a_borrowed_joint() -> None:
