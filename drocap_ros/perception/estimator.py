@@ -16,9 +16,10 @@ from drocap_ros.perception.load_models import limited_use, load_detector, load_f
 from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.scene import Scene, SceneStep
+from drocap_ros.perception.scene import JITTER_NS, Scene, SceneStep
 from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.tracking.camera_motion import sweeps
+from drocap_ros.perception.tracking.choice import CERTAIN_SCORE
 from drocap_ros.perception.tracking.other_poses import OtherPoses
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Subject
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
@@ -26,8 +27,6 @@ from drocap_ros.perception.tracking.search import SubjectSearch
 from drocap_ros.perception.tracking.subject import SubjectTracker
 from drocap_ros.skeleton import BODY_19
 
-_CLEAR_SCORE = 0.6  # detection score from which the next images need no detection, if the pose is clear
-_SLACK_S = 0.005  # tolerance of the detection interval against jitter of the stamps
 _UNSEEN_NS = 80_000_000  # without detection and believable pose until there are no keypoints: two images at 25 Hz
 _LONGEST_PAUSE = 4  # of the pose network under load shedding, over that after a first failure: 0.4 s at 30 Hz
 
@@ -170,7 +169,7 @@ class PoseEstimator:
     ) -> tuple[PoseObservation, bool]:
         """The subject by detection, and whether it is certainly a person."""
         shedding = load_level > 0
-        found = self.search.detect(image, stamp_ns, shedding, close=shedding and self._score >= _CLEAR_SCORE)
+        found = self.search.detect(image, stamp_ns, shedding, close=shedding and self._score >= CERTAIN_SCORE)
 
         def look() -> None:
             self.others.judge(image, stamp_ns, None, self.motion, shedding)
@@ -191,7 +190,7 @@ class PoseEstimator:
     def _pauses(self, subject: Subject, load_level: int) -> bool:
         """Whether the pose network rests under load shedding, after runs without a person and a clear detection."""
         pause = load_level * min(2 ** (self._failures - 1), _LONGEST_PAUSE) if self._failures else 0
-        if subject.score >= _CLEAR_SCORE or self._paused >= pause:
+        if subject.score >= CERTAIN_SCORE or self._paused >= pause:
             return False
         self._paused += 1
         return True
@@ -226,7 +225,7 @@ class PoseEstimator:
 
     def _clear_margins(self, subject: Subject, pose: BodyPose) -> np.ndarray | None:
         """(4,) margins of the box around the joints, over their longer extent; None unless both are clear."""
-        if subject.score < _CLEAR_SCORE or self._confidence < CLEAR_CONFIDENCE or (extent := pose.extent()) is None:
+        if subject.score < CERTAIN_SCORE or self._confidence < CLEAR_CONFIDENCE or (extent := pose.extent()) is None:
             return None
         margins: np.ndarray = (subject.box - extent) / (extent[2:] - extent[:2]).max()
         return margins
@@ -243,8 +242,8 @@ class PoseEstimator:
         if predicted is None:
             return None
         age_s, every_s = (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
-        shedding = self._confidence >= CLEAR_CONFIDENCE and age_s <= load_level * every_s - _SLACK_S
-        recent = shedding or age_s <= every_s - _SLACK_S
+        shedding = self._confidence >= CLEAR_CONFIDENCE and age_s <= load_level * every_s - 1e-9 * JITTER_NS
+        recent = shedding or age_s <= every_s - 1e-9 * JITTER_NS
         alone = recent and self._margins is not None and self.search.isolated(predicted.box, _size(image), stamp_ns)
         if not (alone or shedding):
             return None

@@ -17,7 +17,7 @@ from drocap_ros.perception.models.network_input import shrink
 
 _SIDE_PX = 192  # longer side of the box in the flow's image; smaller boxes are not enlarged
 _MARGIN = 0.25  # around the box, share of its longer side
-_WINDOW_PX = (15, 15)  # of the flow around each joint
+_WINDOW_PX = 15  # of the flow around each joint
 _LEVELS = 2  # of the flow's pyramid: steps up to 7 * 2^2 = 28 px
 _MAX_ERROR = 0.01  # largest forward-backward error of a joint, share of the box's longer side
 _SIGMA = 0.005  # standard deviation that each step adds beside that error, same unit; measured as above
@@ -109,7 +109,7 @@ def _reference(image: np.ndarray, observation: PoseObservation) -> _Reference | 
     length = float((box[2:] - box[:2]).max())
     low = np.clip(np.floor(box[:2] - _MARGIN * length), 0, None)
     high = np.minimum(np.ceil(box[2:] + _MARGIN * length), observation.image_size)
-    if (high - low).min() <= 2 * max(_WINDOW_PX):
+    if (high - low).min() <= 2 * _WINDOW_PX:
         return None
     region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
     return _Reference(observation, region, _view(image, region, length), length)
@@ -119,7 +119,9 @@ def _flow(view: np.ndarray, later: np.ndarray, points: np.ndarray) -> tuple[np.n
     """Points (N, 2) float32 px in the later view, and whether they were found (N,)."""
     import cv2
 
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(view, later, points, points.copy(), winSize=_WINDOW_PX, maxLevel=_LEVELS)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        view, later, points, points.copy(), winSize=(_WINDOW_PX, _WINDOW_PX), maxLevel=_LEVELS
+    )
     return np.asarray(moved), np.asarray(found)[:, 0] == 1
 
 

@@ -14,26 +14,25 @@ from drocap_ros.background import FixedPoints, of_images
 from drocap_ros.clip import Clip
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.perception.detection.nms import iou, overlap_coefficient
+from drocap_ros.perception.detection.nms import MOSTLY, iou, overlap_coefficient
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, LEAST_BESIDE, BodyPose
+from drocap_ros.perception.scene import JITTER_NS
 from drocap_ros.perception.sources.base import Frame, prefetch, with_next
 from drocap_ros.perception.track_video import tracks_from_observations
 from drocap_ros.perception.tracking.appearance import describe, limb_colours
 from drocap_ros.perception.tracking.association import found_again
-from drocap_ros.perception.tracking.own_joints import ExpectedJoints, Poses, contested, own_joints
+from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, ExpectedJoints, Poses, contested, own_joints
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Person, Subject
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
-_EVERY_NS = 200_000_000  # interval of the detections: a walking person moves by a fifth of the length
-_JITTER_NS = 5_000_000  # by which an image may come earlier
+#: Least interval of the detections: a walking person moves by a fifth of the length.
+_EVERY_NS = 200_000_000 - JITTER_NS
 _LEAST_SCORE = 0.45  # least recent mean score of a person; clutter and parts of bodies lie below
 _UNDETECTED_S = 3.0  # time without a detection over which doubtful poses are a person's
 _OVERLAP = 0.02  # overlap coefficient of two boxes from which joints may be the other's
-_LEAST_JOINTS = 4  # of BODY_15 that show a person
-_SAME_BOX = 0.4  # overlap from which a detection is of one whose joints are seen,
 _SAME_BODY = 0.1  # median distance of two poses' joints, lengths, below which they are one person's
 
 
@@ -131,7 +130,7 @@ class PeopleEstimator:
     def _due(self, stamp_ns: int) -> bool:
         """Whether the image of this time is one in which persons are sought."""
         last_ns = self._detected_ns
-        return last_ns is None or stamp_ns < last_ns or stamp_ns - last_ns >= _EVERY_NS - _JITTER_NS
+        return last_ns is None or stamp_ns < last_ns or stamp_ns - last_ns >= _EVERY_NS
 
     def _detect(self, image: np.ndarray, stamp_ns: int) -> list[Person]:
         """Update everybody with detections; returns those who have one."""
@@ -230,7 +229,7 @@ class PeopleEstimator:
         recent = (stamp_ns - expected.detected_ns) * 1e-9 <= _UNDETECTED_S
         needed = 0.0 if recent and others else EMPTY_CONFIDENCE if recent else CLEAR_CONFIDENCE
         sure = own & (confidence >= EMPTY_CONFIDENCE)
-        if believed < needed or sure[: len(BODY_15)].sum() < _LEAST_JOINTS:
+        if believed < needed or sure[: len(BODY_15)].sum() < LEAST_JOINTS:
             return
         expected.accept(xy, sure, believed >= EMPTY_CONFIDENCE)
         box = expected.box
@@ -248,7 +247,7 @@ class PeopleEstimator:
     def _begin(self, image: np.ndarray, stamp_ns: int, person: Person) -> None:
         """Begin with the joints of a detected person, perhaps a lost one, if they are nobody's who is in view."""
         shown = [joints.box for _, joints in self._followed() if joints.seen_in(stamp_ns) is not None]
-        if (iou(person.box[None], np.array(shown).reshape(-1, 4)) > _SAME_BOX).any():
+        if (iou(person.box[None], np.array(shown).reshape(-1, 4)) > MOSTLY).any():
             return
         pose = self._estimator.body.estimate(image, person.box)
         belief = pose.belief(image, person.box)

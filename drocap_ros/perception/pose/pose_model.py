@@ -208,7 +208,7 @@ class PoseModel:
         crop = crop_around(box, self.spec.input_size, self.spec.box_padding)
         outputs = self.model(self._normalize(cut(image, crop)))
         corners = np.asarray(box, np.float32).reshape(2, 2)
-        in_crop = (corners - np.array(crop.centre, np.float32)) * crop.scale + np.array(crop.size) / 2
+        in_crop = (corners - np.array(crop.origin, np.float32) - 0.5) * crop.scale + np.array(crop.size) / 2
         peaks = self._decode(outputs, in_crop.reshape(4))
         spread = peaks.spread * np.float32(1 / crop.scale) ** 2
         size = float(max(box[2] - box[0], box[3] - box[1]))

@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import iou, overlap_coefficient
+from drocap_ros.perception.detection.nms import TOUCHES, iou, overlap_coefficient
 from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person
 
 ONE_PERSON = 0.75  # overlap coefficient above which two boxes may be one person's
-MIXED_IOU = 0.1  # overlap above which two persons' appearances mix
 FORGET_S = 20.0  # time after which a lost subject is not re-identified
 #: Dissimilarity (1 - Bhattacharyya coefficient) by which the cost of a look grows by one: one person's looks differ by
 #: 0.02 to 0.05 from image to image, two persons' in like clothes by 0.05 to 0.2;
@@ -25,7 +24,6 @@ _OTHER_SIMILARITY = 0.7  # below which a look is someone else's
 _STUDENT = 3.0  # degrees of freedom of an edge's error: cover, shadows and other persons take an edge away at a time
 _AGAIN = 4.0  # cost of a detection that is mostly inside a better-scored one, or holds it: it may be that one again
 _MISSED = 11.0  # cost of a person without detection: two edges off, or the look of someone else
-_IMPOSSIBLE = 1e6
 
 
 class Seen(NamedTuple):
@@ -39,7 +37,7 @@ class Seen(NamedTuple):
         """(N,) bool, detections that overlap another one, so that their appearances are mixed."""
         overlap = iou(self.boxes, self.boxes)
         np.fill_diagonal(overlap, 0.0)
-        return np.asarray((overlap > MIXED_IOU).any(axis=1))
+        return np.asarray((overlap > TOUCHES).any(axis=1))
 
     def again(self) -> np.ndarray:
         """(N,) bool, detections that share most with one of a higher score."""
@@ -85,7 +83,7 @@ def assign(persons: Sequence[Person], seen: Seen) -> list[tuple[int, int]]:
     from scipy.optimize import linear_sum_assignment
 
     cost = cost_of(persons, seen)
-    nobody = np.full((len(persons), len(persons)), _IMPOSSIBLE)
+    nobody = np.full((len(persons), len(persons)), np.inf)
     # Whoever is seen in most images is seen in this one; a box that came up once or twice rarely is.
     np.fill_diagonal(nobody, [_MISSED + np.log(p.rate / (1.0 - p.rate)) for p in persons])
     rows, columns = linear_sum_assignment(np.concatenate([cost, nobody], axis=1))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.perception.pose.body_pose import BodyPose
+from drocap_ros.perception.pose.body_pose import BOX_MARGIN, SAME_JOINTS, SEEN, BodyPose
 from drocap_ros.perception.tracking.appearance import difference
 from drocap_ros.skeleton import BODY_15, JointSet
 
@@ -22,10 +22,11 @@ _ERROR_PER_S = {"wrist": 1.2, "elbow": 0.8, "ankle": 1.0, "knee": 0.7}  # and mo
 _TRUNK_PER_S = 0.5  # of others; a walk swings a wrist by 2 lengths/s, and the last speed predicts half of it
 _LONGEST_S = 1.0  # over which it grows
 _RATE = 0.6  # weight of a new speed
-_DECAY_S = 0.3  # time in which a speed without measurement falls to a third
-_MARGIN = 0.06  # of the box around the joints, as of a pose's own box
-_LENGTH_RATE = 0.1  # weight of a new length
-_COLOUR_RATE = 0.1  # and of a new colour
+_DECAY_S = 0.3  # time in which a speed without measurement falls to a third: beside another body the joint stays unseen
+_SLOW_RATE = 0.1  # weight of a new length or colour
+
+
+LEAST_JOINTS = 4  # of BODY_15 that show a person
 
 
 class ExpectedJoints:
@@ -78,7 +79,7 @@ class ExpectedJoints:
     def box(self) -> np.ndarray:
         """(4,) px around the expected joints, as a detector gives one."""
         low, high = self.xy.min(axis=0), self.xy.max(axis=0)
-        margin = _MARGIN * float((high - low).max())
+        margin = BOX_MARGIN * float((high - low).max())
         return np.concatenate([low - margin, high + margin])
 
     def accept(self, xy: np.ndarray, own: np.ndarray, believed: bool) -> None:
@@ -97,22 +98,21 @@ class ExpectedJoints:
             self.seen_ns = self.stamp_ns
             extent = self.box
             length = float((extent[2:] - extent[:2]).max())
-            self.length += _LENGTH_RATE * (length - self.length)
+            self.length += _SLOW_RATE * (length - self.length)
 
     def look(self, colours: np.ndarray, free: np.ndarray) -> None:
         """Add colours (P, 3) of the limbs: unknown ones, and those at joints (P,) bool where nobody else is."""
         first = np.isnan(self.colours) & np.isfinite(colours)
         self.colours[first] = colours[first]
-        self.colours += _COLOUR_RATE * np.nan_to_num(colours - self.colours) * free[:, None]
+        self.colours += _SLOW_RATE * np.nan_to_num(colours - self.colours) * free[:, None]
 
     def keep_look(self, before: ExpectedJoints) -> None:
         """Take over the known colours of the joints of an earlier track."""
         self.colours = np.where(np.isnan(before.colours), self.colours, before.colours)
 
 
-_ONE_PLACE = 0.08  # distance of joints that may be one, lengths of the body
-_NEAR_S = 0.7  # time to an image in which the joint is nobody else's, on either side
-_OFF_WAY = 0.08  # distance from the way between these images at which it is still the own, lengths,
+_NEAR_S = 0.7  # time to an image in which a joint is nobody else's, on either side
+_ONE_PLACE = 0.08  # distance of joints that may be one, and from the way between these images, lengths of the body,
 _OFF_PER_S = 0.15  # and more per second to the nearer one
 
 
@@ -149,16 +149,13 @@ def _is_off(xy: np.ndarray, sure: np.ndarray, times: np.ndarray, f: int, length:
     if max(since, until) > _NEAR_S:
         return True
     way = xy[before] + since / (since + until) * (xy[after] - xy[before])
-    return bool(np.linalg.norm(xy[f] - way) > length * (_OFF_WAY + _OFF_PER_S * min(since, until)))
+    return bool(np.linalg.norm(xy[f] - way) > length * (_ONE_PLACE + _OFF_PER_S * min(since, until)))
 
 
-_SEEN = 0.3  # least confidence of a joint that counts
-_SAME = 0.05  # distance of one joint in two poses, lengths
 _FAR = 3.0  # standard deviations from which a joint's place says no more
-_DROP = 4.5  # cost of a joint that is given to nobody: at three deviations,
+_DROP = 0.5 * _FAR**2  # cost of a joint that is given to nobody,
 _DROP_BODY = 3.0  # and mean cost of a pose that is nobody's
-_OTHER_LOOK = 1.5  # deviations of a limb's colour from which it may be another body's
-_STALE_S = 0.3  # time after which an unseen joint may be anywhere: beside another body it stays unseen
+_OFF = 1.5  # deviations of a joint's place or of its limb's colour from which it may be another body's
 _CLEARLY = 2.0  # times as far from the own body as from the other, from which a joint is the other's
 #: Longest limbs over the length of a standing body, a third more than of most: (joint, its parent) by names.
 _LONGEST = {"knee": 0.36, "ankle": 0.36, "elbow": 0.27, "wrist": 0.24, "shoulder": 0.2, "hip": 0.16, "head": 0.26}
@@ -172,15 +169,8 @@ class Poses(NamedTuple):
     colours: np.ndarray
 
 
-class Owned(NamedTuple):
-    """Which pose each of N bodies has, -1 = none; and of which pose each joint (N, P) is, -1 = of none."""
-
-    pose: np.ndarray
-    joint: np.ndarray
-
-
-def own_joints(tracks: Sequence[ExpectedJoints], poses: Poses) -> Owned:
-    """The joints of overlapping bodies, of the poses in the boxes where each was expected."""
+def own_joints(tracks: Sequence[ExpectedJoints], poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the poses in the boxes of overlapping bodies each (N,) has; of which each joint (N, P) is; -1 = none."""
     body = _bodies(tracks, poses)
     count = len(BODY_15)
     joint = np.repeat(body[:, None], poses.xy.shape[1], axis=1)
@@ -193,7 +183,7 @@ def own_joints(tracks: Sequence[ExpectedJoints], poses: Poses) -> Owned:
         mixed = _mixed(track, others, xy[:count]) | _of_others_colour(track, others, xy[:count], colours[:count])
         joint[k, :count] = np.where(mixed, -1, joint[k, :count])
         joint[k] = np.where(_too_long(track, _of(poses, joint[k])), -1, joint[k])
-    return Owned(body, joint)
+    return body, joint
 
 
 def _of(poses: Poses, joint: np.ndarray) -> np.ndarray:
@@ -221,8 +211,8 @@ def _bodies(tracks: Sequence[ExpectedJoints], poses: Poses) -> np.ndarray:
     count = len(BODY_15)
     cost = np.full((len(tracks), 2 * len(tracks)), _DROP_BODY)
     for i in range(len(tracks)):
-        seen = poses.confidence[i, :count] >= _SEEN
-        if seen.sum() < 4 or _given_before(tracks, poses, i):
+        seen = poses.confidence[i, :count] >= SEEN
+        if seen.sum() < LEAST_JOINTS or _given_before(tracks, poses, i):
             cost[:, i] = 2 * _DROP_BODY
             continue
         for k, track in enumerate(tracks):
@@ -245,12 +235,15 @@ def _given_before(tracks: Sequence[ExpectedJoints], poses: Poses, i: int) -> boo
     for other in range(len(tracks)):
         if other == i:
             continue
-        seen = np.minimum(poses.confidence[i], poses.confidence[other])[:count] >= _SEEN
-        if seen.sum() < 4:
+        seen = np.minimum(poses.confidence[i], poses.confidence[other])[:count] >= SEEN
+        if seen.sum() < LEAST_JOINTS:
             continue
         apart = np.linalg.norm(poses.xy[i] - poses.xy[other], axis=1)[:count][seen]
         better = float(poses.confidence[other, :count].mean()), -other
-        if np.median(apart) < _SAME * tracks[i].length and better > (float(poses.confidence[i, :count].mean()), -i):
+        if np.median(apart) < SAME_JOINTS * tracks[i].length and better > (
+            float(poses.confidence[i, :count].mean()),
+            -i,
+        ):
             return True
     return False
 
@@ -261,7 +254,7 @@ def _joint(tracks: Sequence[ExpectedJoints], poses: Poses, body: np.ndarray, j: 
     for k, i in enumerate(body):
         if i >= 0:
             cost = _cost(tracks[k], poses.xy[i])[j] + 0.5 * _look(tracks[k], poses.colours[i])[j]
-            result[k] = i if poses.confidence[i, j] >= _SEEN and cost < _DROP else -1
+            result[k] = i if poses.confidence[i, j] >= SEEN and cost < _DROP else -1
     return _once(tracks, poses, result, j)
 
 
@@ -271,7 +264,7 @@ def _once(tracks: Sequence[ExpectedJoints], poses: Poses, result: np.ndarray, j:
         for b in range(a + 1, len(tracks)):
             if result[a] < 0 or result[b] < 0:
                 continue
-            near = _SAME * max(tracks[a].length, tracks[b].length)
+            near = SAME_JOINTS * max(tracks[a].length, tracks[b].length)
             places = poses.xy[result[a], j], poses.xy[result[b], j]
             if np.linalg.norm(places[0] - places[1]) > near or np.linalg.norm(tracks[a].xy[j] - tracks[b].xy[j]) < near:
                 continue
@@ -287,14 +280,14 @@ def _mixed(track: ExpectedJoints, others: Sequence[ExpectedJoints], xy: np.ndarr
     """(15,) bool: joints (15, 2) px off their expected places, or unseen for long, where another body's may be."""
     count = len(xy)
     own = np.linalg.norm(xy - track.xy[:count], axis=1) / track.reach[:count]
-    stale = (track.stamp_ns - track.joints_ns[:count]) * 1e-9 > _STALE_S
+    stale = (track.stamp_ns - track.joints_ns[:count]) * 1e-9 > _DECAY_S
     mixed = np.zeros(count, bool)
     for other in others:
         reach = other.reach[:count]
         same = np.linalg.norm(xy - other.xy[:count], axis=1) / reach
         mirror = np.linalg.norm(xy - other.xy[BODY_15.mirror], axis=1) / reach[BODY_15.mirror]
         theirs = np.minimum(same, mirror)
-        mixed |= ((own > 1.5) & (theirs * _CLEARLY < own) | stale) & (theirs < _FAR)
+        mixed |= ((own > _OFF) & (theirs * _CLEARLY < own) | stale) & (theirs < _FAR)
     return mixed
 
 
@@ -309,7 +302,7 @@ def _of_others_colour(
         for side in (np.arange(count), BODY_15.mirror):
             theirs = np.nan_to_num(difference(colours, other.colours[side]), nan=np.inf)
             near = np.linalg.norm(xy - other.xy[side], axis=1) < _FAR * other.reach[side]
-            found |= near & (own > _OTHER_LOOK) & (theirs * _CLEARLY < own)
+            found |= near & (own > _OFF) & (theirs * _CLEARLY < own)
     return found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.tracking.camera_motion import moved_box
-from drocap_ros.perception.tracking.own_joints import ExpectedJoints
+from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, ExpectedJoints
 
 #: Standard deviation of a measured box: centre in lengths, logarithm of the sizes.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
@@ -135,20 +135,18 @@ CONFIRM_CONFIDENCE = 0.5
 SURE_CONFIDENCE = 0.7
 _IMPLAUSIBLE = 0.45  # recent mean confidence of a track without a person
 _USUAL_SHARE = 0.7  # least share of the usual confidence that is believed: persons of 0.9 do not stay at 0.6
-_SLOW_RATE = 0.1  # weight of a new value in the usual confidence and length, of some ten poses,
+_SLOW_RATE = 0.1  # weight of a new value in the usual confidence, length and appearance, of some ten images,
 _RECENT_RATE = 0.3  # and in recent means, of some three
 _QUESTION_S = 1.0  # time of poses without belief after which a track is questioned,
 _DROP_S = 2.5  # and after which one without a person is dropped
-_APPEARANCE_RATE = 0.08  # weight of a new descriptor in the mean appearance
-_SETTLED = 10  # descriptors in a settled mean appearance
 #: Deviation of a person's limbs in the image from their recent lengths, shares of the body's: poses of one person have
 #: 0.02 to 0.05, who runs 0.1, two persons' or shadows' 0.1 to 0.4;
-_LIMBS, _LEAST_LIMBS = 0.08, 5
+_LIMBS = 0.08
 _LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn and stoop
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
 _LONG_AGO_NS = 10**18
-#: First, least and largest recent share of detections of a person, and the weight of a new image in it.
-_FIRST_RATE_SEEN, _RATES, _SEEN_RATE = 0.5, (0.2, 0.9), 0.2
+#: First, least and largest recent share of detections of a person.
+_FIRST_RATE_SEEN, _RATES = 0.5, (0.2, 0.9)
 
 
 class PoseBelief:
@@ -209,7 +207,7 @@ class PoseBelief:
         if self._limbs is None or self.believed_ns is None:
             return 1.0
         off = (limbs / self.length - self._limbs) ** 2
-        if np.isfinite(off).sum() < _LEAST_LIMBS:
+        if np.isfinite(off).sum() < LEAST_JOINTS:
             return 1.0
         # Few poses tell little about the usual lengths.
         variance = _LIMBS**2 * (1 + 1 / self._poses) + _LIMBS_PER_S**2 * (stamp_ns - self.believed_ns) * 1e-9
@@ -345,7 +343,7 @@ class Person:
 
     def searched(self, found: bool) -> None:
         """Count an image in which it was sought at its place."""
-        self.rate = float(np.clip(self.rate + _SEEN_RATE * (found - self.rate), *_RATES))
+        self.rate = float(np.clip(self.rate + _RECENT_RATE * (found - self.rate), *_RATES))
 
     def update(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
         """Update with a detection, not yet confirmed."""
@@ -399,13 +397,12 @@ class Person:
         self.recent = _blend(self.recent, appearance, _RECENT_RATE)
         if lasting or not self.appearance_settled:
             self._descriptors += 1
-            rate = max(_APPEARANCE_RATE, 1 / self._descriptors) if self._descriptors < _SETTLED else _APPEARANCE_RATE
-            self.appearance = _blend(self.appearance, appearance, rate)
+            self.appearance = _blend(self.appearance, appearance, max(_SLOW_RATE, 1 / self._descriptors))
 
     @property
     def appearance_settled(self) -> bool:
         """Whether the appearance is a mean over enough images."""
-        return self._descriptors >= _SETTLED
+        return self._descriptors * _SLOW_RATE >= 1.0
 
     def similarity(self, appearance: np.ndarray | None) -> float:
         """Bhattacharyya coefficient with a descriptor in [0, 1]; 0.5 when one is unknown."""

@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import iou, overlap_coefficient
+from drocap_ros.perception.detection.nms import MOSTLY, PARTLY, TOUCHES, iou, overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import (
     FORGET_S,
@@ -34,19 +34,14 @@ from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorCo
 
 _USUAL = 0.9  # share of the usual belief in a pose below which its box counts less,
 _LEAST_BELIEF = 0.05  # as if it had this one at least
-SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same
-_HIDDEN_IOU = 0.25  # overlap with another person from which a predicted box counts as hidden
-_MEETS = 0.3  # overlap coefficient from which the subject meets someone,
-_MET_NS = 3_000_000_000  # time after it in which either may be taken for the other,
+_SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same: at a half, one around two is not
+_MET_NS = 3_000_000_000  # time after the subject meets someone in which either may be taken for the other,
 _EXCHANGED = 2.5  # and difference of the looks' costs from which they were
-_SECOND_IOU = 0.35  # overlap above which a detection of its look is a second box of the subject
-_APART = 0.5  # overlap coefficient below which two boxes hold two persons, if each holds one
-_ROI_IOU = 0.1  # overlap with the subject below which a box of the drone's tracker is another choice
 _MOST_CHANGES = 1000  # kept of a run that may last for days
 _BYSTANDER_S = 2.0  # longest gap of a bystander
 _MAX_PERSONS = 30  # in memory: the assignment's time grows with their number
 _LEAVING_SPEED = 0.15  # outward speed, lengths/s, of a box at the image's edge that counts as leaving
-_EDGE = 0.01  # share of the image's longer side within which a box is at its edge
+EDGE = 0.01  # share of the image's longer side within which a box is at its edge
 
 
 class Change(Enum):
@@ -113,7 +108,7 @@ class SubjectTracker:
     def apart(self, person: Person) -> bool:
         """Whether the boxes of a person and of the subject hold two persons, if each holds one."""
         subject = self.subject
-        return subject is None or bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
+        return subject is None or bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < MOSTLY)
 
     @property
     def missed(self) -> bool:
@@ -129,7 +124,7 @@ class SubjectTracker:
             return Subject(self._track_id, subject.box, subject.score, False)
         box, confirmed = subject.filter.box(), [p for p in self.persons if p.confirmed_ns == stamp_ns]
         hiding = boxes_of(p for p in confirmed if p is not subject and p.plausible)
-        return Subject(self._track_id, box, 0.0, bool((iou(box[None], hiding) > _HIDDEN_IOU).any()))
+        return Subject(self._track_id, box, 0.0, bool((iou(box[None], hiding) > PARTLY).any()))
 
     def predict(self, stamp_ns: int) -> Subject | None:
         """The predicted subject; None unless the last update confirmed it."""
@@ -162,7 +157,7 @@ class SubjectTracker:
         They are the person without the shadow or someone else beside it, or the whole person.
         """
         shared = overlap_coefficient(self._free.boxes, subject.box[None])[:, 0] > ONE_PERSON
-        same = iou(self._free.boxes, subject.box[None])[:, 0] > SAME_BOX_IOU
+        same = iou(self._free.boxes, subject.box[None])[:, 0] > _SAME_BOX_IOU
         order = np.argsort(-self._free.scores, kind="stable")
         return [(self._free.boxes[j], float(self._free.scores[j])) for j in order if shared[j] and not same[j]]
 
@@ -299,7 +294,7 @@ class SubjectTracker:
         In each image the places count more than the looks; what the looks say adds up over the images.
         """
         for person in self.detected(stamp_ns):
-            if overlap_coefficient(person.box[None], subject.box[None])[0, 0] > _MEETS:
+            if overlap_coefficient(person.box[None], subject.box[None])[0, 0] > PARTLY:
                 person.met_ns = subject.met_ns = stamp_ns
             # Of a track that began at the meeting no look is known but the one it has now.
             new = stamp_ns - person.first_ns <= _MET_NS
@@ -333,7 +328,7 @@ class SubjectTracker:
                 continue
             if subject is not None and not is_someone_else(subject, seen.appearances[j]):
                 here = subject.box if subject.detected_ns == stamp_ns else subject.filter.box()
-                if iou(box, here[None])[0, 0] > _SECOND_IOU or overlap_coefficient(box, here[None])[0, 0] > ONE_PERSON:
+                if iou(box, here[None])[0, 0] > PARTLY or overlap_coefficient(box, here[None])[0, 0] > ONE_PERSON:
                     continue
             self.persons.append(Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j]))
 
@@ -361,7 +356,7 @@ class SubjectTracker:
     def _apply_roi(self, roi: np.ndarray, stamp_ns: int) -> None:
         """A roi away from the subject is a choice; one on the subject replaces missing detections."""
         subject = self.subject
-        if subject is None or iou(roi[None], subject.filter.box()[None])[0, 0] < _ROI_IOU:
+        if subject is None or iou(roi[None], subject.filter.box()[None])[0, 0] < TOUCHES:
             self.choice.box = roi
         elif self._config.subject == "roi" and subject.unconfirmed_s(stamp_ns) > 0.5 * self._coast_s:
             subject.update(roi, 0.0, stamp_ns)
@@ -403,13 +398,13 @@ class SubjectTracker:
 def _behind(person: Person, others: np.ndarray) -> bool:
     """Whether the joints of a person are expected behind somebody in boxes (N, 4) px, where they stay until then."""
     joints = person.joints
-    return joints is not None and bool((overlap_coefficient(joints.box[None], others) > _APART).any())
+    return joints is not None and bool((overlap_coefficient(joints.box[None], others) > MOSTLY).any())
 
 
 def _leaving(person: Person, image_shape: tuple[int, ...]) -> bool:
     """Whether the person's last box touches an edge of the image and moves outwards."""
     height, width = image_shape[:2]
-    edge = _EDGE * max(width, height)
+    edge = EDGE * max(width, height)
     x0, y0, x1, y1 = person.box
     vx, vy = person.filter.x[:2, 1] / person.filter.length
     out = ((x0 < edge, -vx), (x1 > width - edge, vx), (y0 < edge, -vy), (y1 > height - edge, vy))

@@ -46,27 +46,27 @@ def poses(*xy: np.ndarray) -> Poses:
 
 def test_own_poses_stay_with_their_bodies_where_two_cross() -> None:
     for frame, least in ((nearest(0, 1), 0.6), (nearest(0, 1) - 3, 0.85)):  # joints at one place are nobody's
-        owned = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[0][frame], TRUTH[1][frame]))
-        assert owned.pose.tolist() == [0, 1]
+        pose, joint = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[0][frame], TRUTH[1][frame]))
+        assert pose.tolist() == [0, 1]
         for k in (0, 1):
-            assert (owned.joint[k] >= 0).mean() > least
-            assert not (owned.joint[k] == 1 - k).any()
+            assert (joint[k] >= 0).mean() > least
+            assert not (joint[k] == 1 - k).any()
 
 
 def test_poses_that_the_boxes_exchanged_go_back() -> None:
     frame = nearest(0, 1) - 4
-    owned = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[1][frame], TRUTH[0][frame]))
-    assert owned.pose.tolist() == [1, 0]
+    pose, _ = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[1][frame], TRUTH[0][frame]))
+    assert pose.tolist() == [1, 0]
 
 
 def test_one_body_in_both_boxes_is_that_of_whom_it_fits() -> None:
     frame = nearest(0, 1) - 4
     for front in (0, 1):
         twice = poses(TRUTH[front][frame], TRUTH[front][frame] + 0.5)
-        owned = own_joints(tracks_up_to(frame, (0, 1)), twice)
-        assert owned.pose[front] >= 0
-        assert owned.pose[1 - front] == -1
-        assert (owned.joint[1 - front] == -1).all()
+        pose, joint = own_joints(tracks_up_to(frame, (0, 1)), twice)
+        assert pose[front] >= 0
+        assert pose[1 - front] == -1
+        assert (joint[1 - front] == -1).all()
 
 
 def test_wrist_on_another_body_is_dropped() -> None:
@@ -74,10 +74,10 @@ def test_wrist_on_another_body_is_dropped() -> None:
     wrist = BODY_15.index("lwrist")
     borrowed = TRUTH[0][frame].copy()
     borrowed[wrist] = TRUTH[1][frame, wrist]
-    owned = own_joints(tracks_up_to(frame, (0, 1)), poses(borrowed, TRUTH[1][frame]))
-    assert owned.joint[0, wrist] == -1
-    assert owned.joint[1, wrist] == 1
-    assert (np.delete(owned.joint[0], wrist) >= 0).sum() >= 12
+    _, joint = own_joints(tracks_up_to(frame, (0, 1)), poses(borrowed, TRUTH[1][frame]))
+    assert joint[0, wrist] == -1
+    assert joint[1, wrist] == 1
+    assert (np.delete(joint[0], wrist) >= 0).sum() >= 12
 
 
 def test_one_gap_is_as_long_as_many_images_without_the_person() -> None:
