@@ -159,8 +159,7 @@ def joint_set(name: str) -> JointSet:
         raise InputError(f"skeleton: expected one of {', '.join(JOINT_SETS)}, got {name!r}") from None
 
 
-#: Colours of the body's sides and of the camera's path in markers and the viewer, RGB 0 to 255; the report's page
-#: has its own light and dark theme.
+#: Of the body's sides and the camera's path in markers and the viewer, RGB 0 to 255; the report has its own themes.
 COLOURS = {"left": (36, 112, 163), "right": (191, 56, 43), "middle": (90, 90, 90), "path": (51, 179, 77)}
 
 

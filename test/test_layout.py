@@ -29,14 +29,14 @@ BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
      "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "live_replay"): 4.00,  # points of the scene, everybody in the pictures
-    ("perception",): 6.56,  # points of the scene; one who is followed live, and everybody in a recording
+    ("perception",): 6.35,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 12.75,  # one engine and one camera; paths by fixed points, several recordings, live windows
     ("flight",): 9.25,  # a process that holds after the bridge's death; preflight; heights by every source
     ("recording",): 5.10,  # every format of telemetry and of keypoints stayed; damaged and foreign recordings
     ("simulation",): 3.45,  # reports err as recorded ones
     ("evaluation",): 0.97,  # truth from C3D, TRC and BVH by the names of other programs (0.34)
-    ("export", "report", "view"): 4.26,  # exports for OpenSim, a report of several persons, the video beside the body
-    ("ros", "nodes", "bringup"): 4.52,  # lockstep and processes of their own
+    ("export", "report", "view"): 4.25,  # exports for OpenSim, a report of several persons, the video beside the body
+    ("ros", "nodes", "bringup"): 4.51,  # lockstep and processes of their own
     ("cli",): 4.63,  # batch, preflight and top stayed whole
     ("lab", "benchmarks"): 11.74,  # flights that are drawn (0.35), mutants of the product (0.17), heights (0.08)
 }  # fmt: skip

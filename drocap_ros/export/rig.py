@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from drocap_ros.errors import InputError
 from drocap_ros.export.rigid_body import BODY, PARENTS, RigidBody, fit_rigid_body
 from drocap_ros.export.take import ROOT_MOVES_M, Take, without_gaps
+from drocap_ros.geometry.alignment import directions
 from drocap_ros.geometry.rotations import exp_so3, log_so3
 from drocap_ros.skeleton import BODY_15, TOES
 
@@ -215,8 +216,7 @@ def _rotations(body: RigidBody, offsets: dict[str, np.ndarray], rate_hz: float) 
         out[joint] = above
         if child is not None:
             rest = offsets[child] / np.linalg.norm(offsets[child])
-            direction = body.at(child) - body.at(joint)
-            direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+            direction = directions(body.at(child) - body.at(joint))
             out[joint] = above * least_rotation(rest, above.inv().apply(direction), rate_hz)
     return out
 

@@ -11,6 +11,7 @@ from scipy.signal import butter, filtfilt
 
 from drocap_ros.contacts import SHORTEST_SPAN_S, SPAN_AVERAGE_S, rest_spans
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.alignment import directions
 from drocap_ros.geometry.interpolation import true_runs, usual_step
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.skeleton import indices
@@ -279,8 +280,7 @@ def _two_bones(leg: np.ndarray, target: np.ndarray, rate_hz: float) -> tuple[np.
     foot = (thigh**2 - shank**2 + reach**2) / (2.0 * np.maximum(reach, 1e-9))
     height = np.sqrt(np.maximum(thigh**2 - foot**2, 0.0))
     aside = _aside(knee - hip, ankle - hip, rate_hz)
-    aside = aside - along * np.sum(aside * along, axis=1, keepdims=True)
-    aside /= np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
+    aside = directions(aside - along * np.sum(aside * along, axis=1, keepdims=True))
     moved = np.any(target != ankle, axis=1)[:, None]
     new_knee = hip + along * foot[:, None] + aside * height[:, None]
     return np.where(moved, new_knee, knee), np.where(moved, hip + along * reach[:, None], ankle)
@@ -291,7 +291,7 @@ def _aside(knee: np.ndarray, ankle: np.ndarray, rate_hz: float) -> np.ndarray:
 
     Of a straight leg it is chance: there the bent knees of the moments around count.
     """
-    line = ankle / np.maximum(np.linalg.norm(ankle, axis=1, keepdims=True), 1e-9)
+    line = directions(ankle)
     own = knee - line * np.sum(knee * line, axis=1, keepdims=True)
     around = np.nan_to_num(own) * np.linalg.norm(np.nan_to_num(own), axis=1, keepdims=True)
     around = gaussian_filter1d(around, min(max(SPAN_AVERAGE_S * rate_hz, 1e-3), 1000.0), axis=0)

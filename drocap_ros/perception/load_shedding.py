@@ -19,8 +19,8 @@ _SIDE_PX = 192  # longer side of the box in the flow's image; smaller boxes are 
 _MARGIN = 0.25  # around the box, share of its longer side
 _WINDOW_PX = 15  # of the flow around each joint
 _LEVELS = 2  # of the flow's pyramid: steps up to 7 * 2^2 = 28 px
-_MAX_ERROR = 0.01  # largest forward-backward error of a joint, share of the box's longer side
-_SIGMA = 0.005  # standard deviation that each step adds beside that error, same unit; measured as above
+_SIGMA = 0.005  # standard deviation that each step adds, share of the box's longer side; measured as above
+_MAX_ERROR = 2 * _SIGMA  # largest forward-backward error of a joint, which adds to it, same unit
 _MIN_VALID = 0.5  # least share of valid joints; below it the scene changed or the image is blurred
 _LONGEST_S = 0.1  # between the two images: three of 30 Hz
 

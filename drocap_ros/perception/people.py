@@ -22,8 +22,8 @@ from drocap_ros.perception.sources.base import Frame, prefetch, with_next
 from drocap_ros.perception.track_video import tracks_from_observations
 from drocap_ros.perception.tracking.appearance import describe, limb_colours
 from drocap_ros.perception.tracking.association import found_again
-from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, ExpectedJoints, Poses, contested, own_joints
-from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Person, Subject
+from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, ExpectedJoints, Poses, own_joints
+from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, DOUBT_S, EMPTY_CONFIDENCE, Person, Subject
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
@@ -31,7 +31,6 @@ from drocap_ros.tracks import Tracks
 #: Least interval of the detections: a walking person moves by a fifth of the length.
 _EVERY_NS = 200_000_000 - JITTER_NS
 _LEAST_SCORE = 0.45  # least recent mean score of a person; clutter and parts of bodies lie below
-_UNDETECTED_S = 3.0  # time without a detection over which doubtful poses are a person's
 _OVERLAP = 0.02  # overlap coefficient of two boxes from which joints may be the other's
 _SAME_BODY = 0.1  # median distance of two poses' joints, lengths, below which they are one person's
 
@@ -226,7 +225,7 @@ class PeopleEstimator:
         least = np.where(free, self._config.keypoint_threshold, LEAST_BESIDE)
         own = (joint >= 0) & inside & (confidence >= least)
         believed = float(np.where(own, confidence, 0.0)[: len(BODY_15)].mean())
-        recent = (stamp_ns - expected.detected_ns) * 1e-9 <= _UNDETECTED_S
+        recent = (stamp_ns - expected.detected_ns) * 1e-9 <= DOUBT_S
         needed = 0.0 if recent and others else EMPTY_CONFIDENCE if recent else CLEAR_CONFIDENCE
         sure = own & (confidence >= EMPTY_CONFIDENCE)
         if believed < needed or sure[: len(BODY_15)].sum() < LEAST_JOINTS:
@@ -291,16 +290,10 @@ class PeopleEstimator:
         """
         background, nobody = of_images(self._points), [PoseObservation(ns, 0, self._size) for ns in self._stamps]
         found: dict[int, Tracks] = {}
-        lengths = []
         for number, person in self._numbers().items():
             observations = [self._seen[person].get(empty.stamp_ns, empty) for empty in nobody]
             found[number] = replace(tracks_from_observations(observations, 1), background=background)
-            boxes = np.array([observation.roi for observation in observations], float)
-            length = (boxes[:, 2:] - boxes[:, :2]).max(axis=1)
-            lengths.append(np.where(np.isnan(length), np.nanmedian(length), length))
-        stamps = np.array(self._stamps, np.int64)
-        others = contested([tracks.keypoints for tracks in found.values()], stamps, lengths)
-        return {n: _without(tracks, joints) for (n, tracks), joints in zip(found.items(), others, strict=True)}
+        return found
 
     def _numbers(self) -> dict[int, Person]:
         """Those with joints, by the first number of their tracks; who has none gets one after the last."""
@@ -313,19 +306,6 @@ class PeopleEstimator:
         further = sorted((person for person in self._seen if person not in found), key=lambda p: min(self._seen[p]))
         found |= {person: number for number, person in enumerate(further, len(numbered) + 1)}
         return {number: person for person, number in found.items()}
-
-
-def _without(tracks: Tracks, joints: np.ndarray) -> Tracks:
-    """Tracks without the joints (F, P) bool."""
-    assert tracks.confidence is not None
-    assert tracks.covariance is not None
-    blank = np.where(joints, np.nan, 1.0)[..., None]
-    return replace(
-        tracks,
-        keypoints=tracks.keypoints * blank,
-        covariance=tracks.covariance * blank,
-        confidence=np.where(joints, 0.0, tracks.confidence),
-    )
 
 
 def observe_people(

@@ -125,9 +125,10 @@ BOX_MARGIN = 0.06  # of a person's box around the joints, share of their longer 
 _PATCH_PX = 32  # side of the patch in which a shadow is sought
 _AROUND = 0.3  # margin around the box that shows the ground, share of its sides
 #: Brightness of a shadow over that of the ground, sRGB: sun and sky over sky alone; black clothes are darker.
-_SHADOW = (0.3, 0.85)
-_TINT = 0.14  # largest difference between the channels' ratios in a shadow; skylight makes it bluer
-_DIFFERENT = 0.15  # least difference from the ground of what stands or lies on it, share of the brightness
+_DARKEST = 0.3
+#: Least difference from the ground of what stands or lies on it, also of a shadow, and the largest between the ratios
+#: of its channels, as skylight makes it bluer; shares of the brightness.
+_DIFFERENT = 0.15
 _LEAST_DIFFERENT = 0.08  # least share of the box that differs from the ground
 _PENALTY = 0.3  # what a box full of shadow takes from the confidence of its pose, from half a box on
 
@@ -228,7 +229,7 @@ def shadow_share(image: np.ndarray, box: np.ndarray) -> float:
     different = (np.abs(ratio - 1.0) > _DIFFERENT).any(axis=1)
     if different.mean() < _LEAST_DIFFERENT:
         return 0.0
-    shadow = (mean > _SHADOW[0]) & (mean < _SHADOW[1]) & (spread < _TINT)
+    shadow = (mean > _DARKEST) & (mean < 1 - _DIFFERENT) & (spread < _DIFFERENT)
     return float((shadow & different).sum() / different.sum())
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.perception.detection.nms import TOUCHES, iou, overlap_coefficient
-from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person
+from drocap_ros.perception.tracking.person import PREDICTION_S, QUESTION_S, SURE_CONFIDENCE, Person
 
 ONE_PERSON = 0.75  # overlap coefficient above which two boxes may be one person's
 FORGET_S = 20.0  # time after which a lost subject is not re-identified
@@ -99,8 +99,6 @@ _STRANGER = 6.0  # cost of a new track as nobody's who was seen before,
 _ALONE = 9.0  # and where it is certainly a person and no one else may as well be the lost one: the light may change,
 _ALONE_S = 6.0  # within this time
 MARGIN = 1.5  # by which a cost has to be less than another's to be clearly less
-_KNOWN_S = 1.0  # time for which someone new is looked at before the subject is given up for them
-_GONE_S = 0.4  # of a search over the whole image after which someone whom it does not find is out of view
 
 
 def again_cost(lost: Person, person: Person) -> float:
@@ -140,7 +138,7 @@ def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_
         return None
     # A box that came up once or twice, as a second one around the lost person, is nobody who comes back.
     known = [p for p in persons if p is not lost and p.plausible and p.hits > confirm_frames]
-    gone = [p for p in known if p.undetected_s(stamp_ns) > _GONE_S]
+    gone = [p for p in known if p.undetected_s(stamp_ns) > PREDICTION_S]
     if any(look_cost(p, [person.appearance])[0] + MARGIN < look_cost(lost, [person.appearance])[0] for p in gone):
         return None
     # A second box around the same person is no other one.
@@ -157,11 +155,11 @@ def followed_on(lost: Person | None, persons: list[Person], coast_s: float, stam
     place: that is a new track.
     """
     others = [p for p in persons if p is not lost]
-    if lost is None or lost.unconfirmed_s(stamp_ns) <= coast_s + _GONE_S:
+    if lost is None or lost.unconfirmed_s(stamp_ns) <= coast_s + PREDICTION_S:
         return others
-    return [p for p in others if p.undetected_s(stamp_ns) <= _GONE_S]
+    return [p for p in others if p.undetected_s(stamp_ns) <= PREDICTION_S]
 
 
 def certainly_others(lost: Person, persons: list[Person], stamp_ns: int) -> list[Person]:
     """Persons without those who have just come into view: half hidden as yet, they may be the lost subject."""
-    return [p for p in persons if (stamp_ns - p.first_ns) * 1e-9 >= _KNOWN_S or not could_be(lost, p)]
+    return [p for p in persons if (stamp_ns - p.first_ns) * 1e-9 >= QUESTION_S or not could_be(lost, p)]

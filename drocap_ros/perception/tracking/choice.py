@@ -7,12 +7,11 @@ import numpy as np
 from drocap_ros.perception.detection.nms import PARTLY
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import certainly_others
-from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person, person_at
+from drocap_ros.perception.tracking.person import DOUBT_S, SURE_CONFIDENCE, Person, person_at
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
 
 CERTAIN_SCORE = 0.6  # from which the first person ever, and one with a clear pose, needs no further images
 _BELIEF = 4.0  # logarithm of the size that full belief in the pose outweighs: a shadow is no smaller than the person
-_GIVE_UP_S = 3.0  # for ``on_loss = next``: time beyond coasting after which a subject lost in the image is given up
 
 
 class SubjectChoice:
@@ -74,7 +73,7 @@ class SubjectChoice:
             return self._config.subject in ("box", "roi") and (first or waits)
         # Whoever was followed for a moment is not waited for much longer.
         followed_s = (last.confirmed_ns - last.first_ns) * 1e-9
-        longest_s = 0.0 if last.left_image else coast_s + min(_GIVE_UP_S, followed_s)
+        longest_s = 0.0 if last.left_image else coast_s + min(DOUBT_S, followed_s)
         return waits or last.unconfirmed_s(stamp_ns) <= longest_s
 
     def _confirmed(self, person: Person, first: bool) -> bool:

@@ -1,7 +1,7 @@
 """Bodies from image to image, and whose joints are these where persons overlap: each is one body's or nobody's.
 
-Networks that see one box give the joints of whoever is in front.  A joint is where its body's motion lets it be, a limb
-is no longer than that of the body, and two bodies have no joint in common: what that leaves open is dropped.
+Networks that see one box give the joints of whoever is in front.  A joint is where its body's motion lets it be, and
+two bodies have no joint in common: what that leaves open is dropped.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TRUNK_PER_S = 0.5  # of others; a walk swings a wrist by 2 lengths/s, and the l
 _LONGEST_S = 1.0  # over which it grows
 _RATE = 0.6  # weight of a new speed
 _DECAY_S = 0.3  # time in which a speed without measurement falls to a third: beside another body the joint stays unseen
-_SLOW_RATE = 0.1  # weight of a new length or colour
+SLOW_RATE = 0.1  # weight of a new value in what hardly changes: of some ten images
 
 
 LEAST_JOINTS = 4  # of BODY_15 that show a person
@@ -98,58 +98,17 @@ class ExpectedJoints:
             self.seen_ns = self.stamp_ns
             extent = self.box
             length = float((extent[2:] - extent[:2]).max())
-            self.length += _SLOW_RATE * (length - self.length)
+            self.length += SLOW_RATE * (length - self.length)
 
     def look(self, colours: np.ndarray, free: np.ndarray) -> None:
         """Add colours (P, 3) of the limbs: unknown ones, and those at joints (P,) bool where nobody else is."""
         first = np.isnan(self.colours) & np.isfinite(colours)
         self.colours[first] = colours[first]
-        self.colours += _SLOW_RATE * np.nan_to_num(colours - self.colours) * free[:, None]
+        self.colours += SLOW_RATE * np.nan_to_num(colours - self.colours) * free[:, None]
 
     def keep_look(self, before: ExpectedJoints) -> None:
         """Take over the known colours of the joints of an earlier track."""
         self.colours = np.where(np.isnan(before.colours), self.colours, before.colours)
-
-
-_NEAR_S = 0.7  # time to an image in which a joint is nobody else's, on either side
-_ONE_PLACE = 0.08  # distance of joints that may be one, and from the way between these images, lengths of the body,
-_OFF_PER_S = 0.15  # and more per second to the nearer one
-
-
-def contested(people: Sequence[np.ndarray], stamp_ns: np.ndarray, length: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Joints (F, P) bool of each person that are more likely another's.
-
-    people : (F, P, 2) px of each, ``BODY_15`` first; stamp_ns : (F,); length : (F,) px of each one's body
-    """
-    times, count = stamp_ns * 1e-9, len(BODY_15)
-    found = []
-    for k, xy in enumerate(people):
-        near = np.zeros(xy.shape[:2], bool)
-        for other in (o for i, o in enumerate(people) if i != k):
-            for theirs in (other[:, :count], other[:, BODY_15.mirror]):
-                apart = np.linalg.norm(xy[:, :count] - theirs, axis=2)
-                near[:, :count] |= apart < _ONE_PLACE * length[k][:, None]
-        doubtful = np.zeros_like(near)
-        for j in np.flatnonzero(near.any(axis=0)):
-            seen = np.isfinite(xy[:, j]).all(axis=1)
-            sure = np.flatnonzero(seen & ~near[:, j])
-            for f in np.flatnonzero(near[:, j]):
-                doubtful[f, j] = _is_off(xy[:, j], sure, times, int(f), float(length[k][f]))
-        found.append(doubtful)
-    return found
-
-
-def _is_off(xy: np.ndarray, sure: np.ndarray, times: np.ndarray, f: int, length: float) -> bool:
-    """Whether a place (F, 2) px in image ``f`` is off the way between the nearest of the sure images."""
-    at = int(np.searchsorted(sure, f))
-    if at == 0 or at == len(sure):
-        return True
-    before, after = int(sure[at - 1]), int(sure[at])
-    since, until = times[f] - times[before], times[after] - times[f]
-    if max(since, until) > _NEAR_S:
-        return True
-    way = xy[before] + since / (since + until) * (xy[after] - xy[before])
-    return bool(np.linalg.norm(xy[f] - way) > length * (_ONE_PLACE + _OFF_PER_S * min(since, until)))
 
 
 _FAR = 3.0  # standard deviations from which a joint's place says no more
@@ -157,8 +116,6 @@ _DROP = 0.5 * _FAR**2  # cost of a joint that is given to nobody,
 _DROP_BODY = 3.0  # and mean cost of a pose that is nobody's
 _OFF = 1.5  # deviations of a joint's place or of its limb's colour from which it may be another body's
 _CLEARLY = 2.0  # times as far from the own body as from the other, from which a joint is the other's
-#: Longest limbs over the length of a standing body, a third more than of most: (joint, its parent) by names.
-_LONGEST = {"knee": 0.36, "ankle": 0.36, "elbow": 0.27, "wrist": 0.24, "shoulder": 0.2, "hip": 0.16, "head": 0.26}
 
 
 class Poses(NamedTuple):
@@ -182,7 +139,6 @@ def own_joints(tracks: Sequence[ExpectedJoints], poses: Poses) -> tuple[np.ndarr
         colours = poses.colours[np.maximum(joint[k], 0), np.arange(len(joint[k]))]
         mixed = _mixed(track, others, xy[:count]) | _of_others_colour(track, others, xy[:count], colours[:count])
         joint[k, :count] = np.where(mixed, -1, joint[k, :count])
-        joint[k] = np.where(_too_long(track, _of(poses, joint[k])), -1, joint[k])
     return body, joint
 
 
@@ -304,12 +260,3 @@ def _of_others_colour(
             near = np.linalg.norm(xy - other.xy[side], axis=1) < _FAR * other.reach[side]
             found |= near & (own > _OFF) & (theirs * _CLEARLY < own)
     return found
-
-
-def _too_long(track: ExpectedJoints, xy: np.ndarray) -> np.ndarray:
-    """(P,) bool: joints (P, 2) px at the end of a limb longer than a body's."""
-    joints = track.joint_set
-    parents = np.array(joints.parents)
-    length = np.linalg.norm(xy - xy[np.maximum(parents, 0)], axis=1) / track.length
-    longest = np.array([_LONGEST.get(name.lstrip("lr"), np.inf) for name in joints.joints])
-    return np.asarray((parents >= 0) & (length > longest))

@@ -10,7 +10,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.tracking.camera_motion import moved_box
-from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, ExpectedJoints
+from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, SLOW_RATE, ExpectedJoints
 
 #: Standard deviation of a measured box: centre in lengths, logarithm of the sizes.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
@@ -21,7 +21,7 @@ _ACCELERATION = np.array([8.0, 8.0, 2.0, 2.0])
 _FIRST_RATE = np.array([2.0, 2.0, 0.5, 0.5])
 _CAMERA = 0.5  # deviation of the camera's motion at the person, share: water and crowds that move are followed, too
 _DECAY_S = np.array([1.0, 1.0, 0.3, 0.3])  # time in which a rate without measurements falls to a third
-_LONGEST_PREDICTION_S = 0.4  # persons turn, stoop or stop within it
+PREDICTION_S = 0.4  # longest: persons turn, stoop or stop within it
 
 
 class BoxFilter:
@@ -48,7 +48,7 @@ class BoxFilter:
 
     def box_at(self, stamp_ns: int) -> np.ndarray:
         """(4,) px predicted for a time; the state stays."""
-        dt = float(np.clip((stamp_ns - self.stamp_ns) * 1e-9, 0.0, _LONGEST_PREDICTION_S))
+        dt = float(np.clip((stamp_ns - self.stamp_ns) * 1e-9, 0.0, PREDICTION_S))
         x = self.x[:, 0] + dt * self.x[:, 1]
         return _to_box(np.concatenate([x[:2], np.clip(x[2:], 0.0, 10.0)]))
 
@@ -59,7 +59,7 @@ class BoxFilter:
 
     def predict(self, stamp_ns: int) -> None:
         """Advance to a later time; velocities decay without measurements."""
-        dt = min((stamp_ns - self.stamp_ns) * 1e-9, _LONGEST_PREDICTION_S)
+        dt = min((stamp_ns - self.stamp_ns) * 1e-9, PREDICTION_S)
         self.stamp_ns = stamp_ns
         if dt <= 0:
             return
@@ -135,10 +135,10 @@ CONFIRM_CONFIDENCE = 0.5
 SURE_CONFIDENCE = 0.7
 _IMPLAUSIBLE = 0.45  # recent mean confidence of a track without a person
 _USUAL_SHARE = 0.7  # least share of the usual confidence that is believed: persons of 0.9 do not stay at 0.6
-_SLOW_RATE = 0.1  # weight of a new value in the usual confidence, length and appearance, of some ten images,
-_RECENT_RATE = 0.3  # and in recent means, of some three
-_QUESTION_S = 1.0  # time of poses without belief after which a track is questioned,
-_DROP_S = 2.5  # and after which one without a person is dropped
+_RECENT_RATE = 0.3  # weight of a new value in recent means, of some three images
+QUESTION_S = 1.0  # time of poses without belief after which a track is questioned, and of a newcomer who counts,
+_DROP_S = 2.5  # after which one without a person is dropped,
+DOUBT_S = 3.0  # and over which a last detection, or a meeting of two in which they may be exchanged, counts
 #: Deviation of a person's limbs in the image from their recent lengths, shares of the body's: poses of one person have
 #: 0.02 to 0.05, who runs 0.1, two persons' or shadows' 0.1 to 0.4;
 _LIMBS = 0.08
@@ -191,7 +191,7 @@ class PoseBelief:
         self.last, self.judged_ns = confidence, stamp_ns
         if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self.usual):
             self.choose(box, stamp_ns)
-            self.usual = confidence if not self.usual else self.usual + _SLOW_RATE * (confidence - self.usual)
+            self.usual = confidence if not self.usual else self.usual + SLOW_RATE * (confidence - self.usual)
             if limbs is not None:
                 self._poses += 1
                 known = limbs if self._limbs is None else np.where(np.isnan(self._limbs), limbs, self._limbs)
@@ -219,7 +219,7 @@ class PoseBelief:
         if self.plausible_ns is None:
             self.plausible_ns, self.began = stamp_ns, self.box
         length = float((self.box[2:] - self.box[:2]).max())
-        self.length = length if not self.length else self.length + _SLOW_RATE * (length - self.length)
+        self.length = length if not self.length else self.length + SLOW_RATE * (length - self.length)
 
     def growth(self, box: np.ndarray, length: float) -> float:
         """Absolute logarithm of the size of a box (4,) px over the last or the usual one, whichever is nearer.
@@ -243,7 +243,7 @@ class PoseBelief:
     @property
     def questioned(self) -> bool:
         """Whether the poses have not been believable for a second."""
-        return self._fails(_QUESTION_S)
+        return self._fails(QUESTION_S)
 
     @property
     def refuted(self) -> bool:
@@ -397,12 +397,12 @@ class Person:
         self.recent = _blend(self.recent, appearance, _RECENT_RATE)
         if lasting or not self.appearance_settled:
             self._descriptors += 1
-            self.appearance = _blend(self.appearance, appearance, max(_SLOW_RATE, 1 / self._descriptors))
+            self.appearance = _blend(self.appearance, appearance, max(SLOW_RATE, 1 / self._descriptors))
 
     @property
     def appearance_settled(self) -> bool:
         """Whether the appearance is a mean over enough images."""
-        return self._descriptors * _SLOW_RATE >= 1.0
+        return self._descriptors * SLOW_RATE >= 1.0
 
     def similarity(self, appearance: np.ndarray | None) -> float:
         """Bhattacharyya coefficient with a descriptor in [0, 1]; 0.5 when one is unknown."""

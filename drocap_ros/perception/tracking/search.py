@@ -26,9 +26,9 @@ CLOSE = (1.45, 208)
 TIGHT = (1.3, 160)
 _TILE_PX = 800  # images longer than 1.25 of this are also searched in tiles of this side, one per image
 FULL_EVERY_NS = 1_000_000_000  # interval of detection over the whole image while the subject is in view
+SEARCH_EVERY_NS = 300_000_000  # without one, interval of a bystander's poses, and longest gap of one to look at closely
 _ISOLATED = 0.4  # free margin around an isolated subject, lengths
 _REDUCED_INPUT = 0.8  # under load shedding, share of the detector's input for a window
-_CANDIDATE_S = 0.3  # longest gap of a person that the search without a subject centres on
 _WIDER_PER_S = 0.5  # growth of the search around the last place of a lost subject, lengths per second,
 _WIDEST = 2.0  # and its farthest reach, lengths
 _CUT_PX = 2.0  # distance from a window's edge below which a box is cut
@@ -170,7 +170,7 @@ class SubjectSearch:
     def _possible_subject(self, stamp_ns: int) -> Person | None:
         """Who may become the subject: a small person needs a window around it to be confirmed."""
         lost = self._tracker.subject
-        recent = [p for p in self._tracker.persons if p.plausible and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
+        recent = [p for p in self._tracker.persons if p.plausible and stamp_ns - p.detected_ns <= SEARCH_EVERY_NS]
         if lost is not None:  # persons in view together with the subject cannot be the subject
             recent = [p for p in recent if p is not lost and could_be(lost, p)]
         return max(recent, key=lambda p: (p.hits < self._config.confirm_frames, p.mean_score), default=None)

@@ -24,6 +24,7 @@ from drocap_ros.perception.tracking.association import (
 )
 from drocap_ros.perception.tracking.choice import SubjectChoice
 from drocap_ros.perception.tracking.person import (
+    DOUBT_S,
     SURE_CONFIDENCE,
     BoxFilter,
     Person,
@@ -35,8 +36,7 @@ from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorCo
 _USUAL = 0.9  # share of the usual belief in a pose below which its box counts less,
 _LEAST_BELIEF = 0.05  # as if it had this one at least
 _SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same: at a half, one around two is not
-_MET_NS = 3_000_000_000  # time after the subject meets someone in which either may be taken for the other,
-_EXCHANGED = 2.5  # and difference of the looks' costs from which they were
+_EXCHANGED = 2.5  # difference of the looks' costs of two who met from which they were exchanged
 _MOST_CHANGES = 1000  # kept of a run that may last for days
 _BYSTANDER_S = 2.0  # longest gap of a bystander
 _MAX_PERSONS = 30  # in memory: the assignment's time grows with their number
@@ -280,7 +280,7 @@ class SubjectTracker:
                 person.confirm(stamp_ns)
             if person.pose.believed:
                 # Beside the subject either may be taken for the other: what is known of them stays.
-                lasting = not mixed[j] and stamp_ns - person.met_ns > _MET_NS
+                lasting = not mixed[j] and stamp_ns - person.met_ns > 1e9 * DOUBT_S
                 person.update_appearance(seen.appearances[j], lasting)
         for person in persons:
             person.searched(person.detected_ns == stamp_ns)
@@ -297,8 +297,8 @@ class SubjectTracker:
             if overlap_coefficient(person.box[None], subject.box[None])[0, 0] > PARTLY:
                 person.met_ns = subject.met_ns = stamp_ns
             # Of a track that began at the meeting no look is known but the one it has now.
-            new = stamp_ns - person.first_ns <= _MET_NS
-            met = stamp_ns - max(person.met_ns, subject.met_ns if new else 0) <= _MET_NS
+            new = stamp_ns - person.first_ns <= 1e9 * DOUBT_S
+            met = stamp_ns - max(person.met_ns, subject.met_ns if new else 0) <= 1e9 * DOUBT_S
             if not met or person.hits < self._config.confirm_frames:
                 continue
             own, other = (look_cost(p, [subject.recent, person.recent]) for p in (subject, person))

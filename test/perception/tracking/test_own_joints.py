@@ -7,7 +7,7 @@ from people_scenes import PeopleScene, camera_of, people_of
 
 from drocap_ros.perception.pose.body_pose import BodyPose
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.tracking.own_joints import ExpectedJoints, Poses, contested, own_joints
+from drocap_ros.perception.tracking.own_joints import ExpectedJoints, Poses, own_joints
 from drocap_ros.skeleton import BODY_15
 
 SCENE = PeopleScene("cross", 1)
@@ -88,16 +88,3 @@ def test_one_gap_is_as_long_as_many_images_without_the_person() -> None:
     left_out.predict(hidden.stamp_ns)
     apart = np.linalg.norm(left_out.xy - hidden.xy, axis=1)
     assert (apart < 0.15 * np.linalg.norm(hidden.xy - tracks_up_to(10, (0,))[0].xy, axis=1)).all()
-
-
-def test_images_before_and_after_show_a_borrowed_joint() -> None:
-    frame = nearest(0, 1)
-    ankle = BODY_15.index("rankle")
-    seen = [xy.copy() for xy in TRUTH[:2]]
-    far = frame - 8  # the bodies are apart, the joint is not
-    seen[0][far, ankle] = seen[1][far, ankle]
-    length = [np.full(len(TIMES), 200.0)] * 2
-    found = contested(seen, TIMES, length)
-    assert found[0][far, ankle]
-    assert not found[1][far, ankle]
-    assert found[0].mean() < 0.02
