@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,11 +22,13 @@ class Detections:
     boxes : (N, 4) float32 px, x_min y_min x_max y_max, clipped to the image
     scores : (N,) float32 in [0, 1]
     keypoints : (N, P, 3) x y score, of an input alone; None = the network gives none
+    appearances : N descriptors, of those that a tracker assigns
     """
 
     boxes: np.ndarray
     scores: np.ndarray
     keypoints: np.ndarray | None = None
+    appearances: Sequence[np.ndarray | None] = ()
 
     def __len__(self) -> int:
         return len(self.scores)

@@ -7,10 +7,10 @@ assigned one to one, at the least sum: in a crossing each detection has its owne
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import TOUCHES, iou, overlap_coefficient
 from drocap_ros.perception.tracking.person import PREDICTION_S, QUESTION_S, SURE_CONFIDENCE, Person
 
@@ -26,23 +26,17 @@ _AGAIN = 4.0  # cost of a detection that is mostly inside a better-scored one, o
 _MISSED = 11.0  # cost of a person without detection: two edges off, or the look of someone else
 
 
-class Seen(NamedTuple):
-    """Detections in one image: boxes (N, 4) px, scores (N,), and N descriptors of the appearance."""
+def mixed(seen: Detections) -> np.ndarray:
+    """(N,) bool, detections that overlap another one, so that their appearances are mixed."""
+    overlap = iou(seen.boxes, seen.boxes)
+    np.fill_diagonal(overlap, 0.0)
+    return np.asarray((overlap > TOUCHES).any(axis=1))
 
-    boxes: np.ndarray
-    scores: np.ndarray
-    appearances: list[np.ndarray | None]
 
-    def mixed(self) -> np.ndarray:
-        """(N,) bool, detections that overlap another one, so that their appearances are mixed."""
-        overlap = iou(self.boxes, self.boxes)
-        np.fill_diagonal(overlap, 0.0)
-        return np.asarray((overlap > TOUCHES).any(axis=1))
-
-    def again(self) -> np.ndarray:
-        """(N,) bool, detections that share most with one of a higher score."""
-        better = self.scores[None] > self.scores[:, None]
-        return np.asarray((better & (overlap_coefficient(self.boxes, self.boxes) > ONE_PERSON)).any(axis=1))
+def _again(seen: Detections) -> np.ndarray:
+    """(N,) bool, detections that share most with one of a higher score."""
+    better = seen.scores[None] > seen.scores[:, None]
+    return np.asarray((better & (overlap_coefficient(seen.boxes, seen.boxes) > ONE_PERSON)).any(axis=1))
 
 
 def look_cost(person: Person, appearances: Sequence[np.ndarray | None]) -> np.ndarray:
@@ -68,15 +62,15 @@ def place_cost(person: Person, boxes: np.ndarray, expected: bool = False) -> np.
     return np.asarray(0.5 * (_STUDENT + 1) * np.log1p(deviation**2 / _STUDENT) @ weight + np.log(spread))
 
 
-def cost_of(persons: Sequence[Person], seen: Seen) -> np.ndarray:
+def cost_of(persons: Sequence[Person], seen: Detections) -> np.ndarray:
     """(M, N) of the detections as the persons', who are predicted to their image."""
     cost = np.empty((len(persons), len(seen.boxes)))
     for i, person in enumerate(persons):
         cost[i] = place_cost(person, seen.boxes) + look_cost(person, seen.appearances) - np.log(seen.scores)
-    return np.asarray(cost + _AGAIN * seen.again())
+    return np.asarray(cost + _AGAIN * _again(seen))
 
 
-def assign(persons: Sequence[Person], seen: Seen) -> list[tuple[int, int]]:
+def assign(persons: Sequence[Person], seen: Detections) -> list[tuple[int, int]]:
     """Pairs (person, detection) of the least sum of costs; whoever is in none was not detected."""
     if not persons or not len(seen.boxes):
         return []

@@ -8,18 +8,19 @@ from enum import Enum
 
 import numpy as np
 
+from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import MOSTLY, PARTLY, TOUCHES, iou, overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import (
     FORGET_S,
     MARGIN,
     ONE_PERSON,
-    Seen,
     assign,
     followed_on,
     found_again,
     is_someone_else,
     look_cost,
+    mixed,
     place_cost,
 )
 from drocap_ros.perception.tracking.choice import SubjectChoice
@@ -79,7 +80,7 @@ class SubjectTracker:
         self._coast_s = config.coast_s
         self._last_ns: int | None = None
         #: Detections of the last image that are nobody's.
-        self._free = Seen(np.empty((0, 4)), np.empty(0), [])
+        self._free = Detections(np.empty((0, 4)), np.empty(0))
 
     def reset(self) -> None:
         """Delete all tracks, for stamps that restarted; track ids continue."""
@@ -246,10 +247,10 @@ class SubjectTracker:
         self._last_ns = stamp_ns
         for person in self.persons:
             person.filter.predict(stamp_ns)
-        seen = Seen(boxes.astype(float), scores, [describe(image, box) for box in boxes])
+        seen = Detections(boxes.astype(float), scores, appearances=[describe(image, box) for box in boxes])
         assigned = self._assign(seen, stamp_ns)
         free = [j for j in range(len(boxes)) if j not in assigned]
-        self._free = Seen(seen.boxes[free], scores[free], [seen.appearances[j] for j in free])
+        self._free = Detections(seen.boxes[free], scores[free])
         self._spawn(seen, assigned, stamp_ns)
         self._reidentify(stamp_ns)
         if look is not None and self.current(stamp_ns) is None:
@@ -265,13 +266,13 @@ class SubjectTracker:
         self._is_shown = shown is not None
         return shown
 
-    def _assign(self, seen: Seen, stamp_ns: int) -> set[int]:
+    def _assign(self, seen: Detections, stamp_ns: int) -> set[int]:
         """Update everybody with their detections; returns the indices of these."""
         persons = followed_on(self.subject, self.persons, self._coast_s, stamp_ns)
         if (subject := self.followed(stamp_ns)) is not None:
             persons = [subject, *persons]
         persons = [p for p in persons if p.detected_ns < stamp_ns]
-        pairs, mixed = assign(persons, seen), seen.mixed()
+        pairs, blended = assign(persons, seen), mixed(seen)
         for i, j in pairs:
             person = persons[i]
             person.update(seen.boxes[j], float(seen.scores[j]), stamp_ns)
@@ -280,7 +281,7 @@ class SubjectTracker:
                 person.confirm(stamp_ns)
             if person.pose.believed:
                 # Beside the subject either may be taken for the other: what is known of them stays.
-                lasting = not mixed[j] and stamp_ns - person.met_ns > 1e9 * DOUBT_S
+                lasting = not blended[j] and stamp_ns - person.met_ns > 1e9 * DOUBT_S
                 person.update_appearance(seen.appearances[j], lasting)
         for person in persons:
             person.searched(person.detected_ns == stamp_ns)
@@ -317,7 +318,7 @@ class SubjectTracker:
         person.left_image = False
         self.changes.append((self._last_ns or 0, f"person {track_id} {change.value}"))
 
-    def _spawn(self, seen: Seen, assigned: set[int], stamp_ns: int) -> None:
+    def _spawn(self, seen: Detections, assigned: set[int], stamp_ns: int) -> None:
         """Start tracks from unassigned detections, except parts of tracked persons and second boxes of the subject."""
         # Leaves and signs that were found to be no person may cover one.
         known = boxes_of(p for p in self.persons if p.detected_ns == stamp_ns and p.plausible)
