@@ -328,7 +328,7 @@ def fit(cases: list[Case], degraded: list[Case], spread_share: float) -> Calibra
 
     b = np.append(minimize(cross_entropy, np.zeros(features.shape[1])).x, [0.0, 0.0])[:4]
     rounded = tuple(round(float(s), 4) for s in sigmas)
-    return Calibration(tuple(map(float, knots)), rounded, spread_share, *(round(float(v), 3) for v in b))
+    return Calibration(rounded, spread_share, *(round(float(v), 3) for v in b), scores=tuple(map(float, knots)))
 
 
 def tracking() -> str:

@@ -12,8 +12,8 @@ from drocap_ros.errors import InputError
 
 #: Field -> the array of a tracks file that holds it.
 ARRAYS = {"frame": "background_frame", "track": "background_track", "point": "background_point"}
-#: Points beyond it (px) lie in no image: a hundred times the width of the largest.
-_FARTHEST_PX = 1e6
+#: Points and keypoints beyond it (px) lie in no image: a hundred times the width of the largest.
+FARTHEST_PX = 1e6
 #: Observations kept of a recording: 20 minutes at 30 Hz with 160 points, 120 MB; of an hour those of every fourth
 #: image, with which the tracks of its 4K video stay within 1 GiB.
 MOST_ROWS = 6_000_000
@@ -43,9 +43,9 @@ class Background:
                 raise InputError(
                     f"{ARRAYS[name]}: expected {kind} {shape}, got {value.dtype} {value.shape}; one row per observation"
                 )
-        if not (np.isfinite(self.point).all() and np.abs(self.point).max(initial=0.0) <= _FARTHEST_PX):
+        if not (np.isfinite(self.point).all() and np.abs(self.point).max(initial=0.0) <= FARTHEST_PX):
             raise InputError(
-                f"{ARRAYS['point']}: expected finite px within {_FARTHEST_PX:g}, got others; leave lost points out"
+                f"{ARRAYS['point']}: expected finite px within {FARTHEST_PX:g}, got others; leave lost points out"
             )
 
     def __len__(self) -> int:
@@ -88,7 +88,7 @@ def read_background(arrays: Mapping[str, np.ndarray]) -> Background | None:
         _whole(frame, "frame").astype(np.int32),
         _whole(track, "track").astype(np.int64),
         # Clipped values are refused, too: single precision cannot hold every double.
-        np.clip(point, -2 * _FARTHEST_PX, 2 * _FARTHEST_PX).astype(np.float32),
+        np.clip(point, -2 * FARTHEST_PX, 2 * FARTHEST_PX).astype(np.float32),
     )
 
 

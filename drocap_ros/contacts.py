@@ -55,8 +55,8 @@ _PARTING_STD_M_S = 0.07
 _PARTING_OF_MEDIAN = 0.7
 
 #: Time (s) over which the velocity of a foot of a finished motion is averaged, and least duration of its rest.
-_SPAN_AVERAGE_S = 0.15
-_SHORTEST_SPAN_S = 0.2  # the latter
+SPAN_AVERAGE_S = 0.15
+SHORTEST_SPAN_S = 0.2  # the latter
 
 
 class RestingFeet:
@@ -154,13 +154,13 @@ def rest_spans(foot: np.ndarray, rate_hz: float) -> list[tuple[int, int]]:
     from scipy.ndimage import uniform_filter1d
 
     velocity = np.gradient(foot, axis=0) * rate_hz
-    width = min(max(round(_SPAN_AVERAGE_S * rate_hz), 1), len(foot))
+    width = min(max(round(SPAN_AVERAGE_S * rate_hz), 1), len(foot))
     known = np.isfinite(velocity).all(axis=1)
     # The running average would carry NaN on to the end.
     average = uniform_filter1d(np.where(known[:, None], velocity, 0.0), width, axis=0, mode="nearest")
     whole = uniform_filter1d(known.astype(np.float64), width, mode="nearest") > 1.0 - 1e-6
     still = whole & (np.linalg.norm(average, axis=1) < MOTION_REST_M_S)
-    return [(int(a), int(b)) for a, b in true_runs(still) if b - a >= max(_SHORTEST_SPAN_S * rate_hz, 2)]
+    return [(int(a), int(b)) for a, b in true_runs(still) if b - a >= max(SHORTEST_SPAN_S * rate_hz, 2)]
 
 
 def _resting_together(looks: np.ndarray, parting: np.ndarray) -> np.ndarray:

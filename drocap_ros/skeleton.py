@@ -159,8 +159,8 @@ def joint_set(name: str) -> JointSet:
         raise InputError(f"skeleton: expected one of {', '.join(JOINT_SETS)}, got {name!r}") from None
 
 
-#: Colour of a body side in markers and in the viewer, RGB 0 to 255; the report's page has its own light and dark theme.
-SIDE_COLOURS = {"left": (36, 112, 163), "right": (191, 56, 43), "middle": (90, 90, 90)}
+#: Of the body's sides and the camera's path in markers and the viewer, RGB 0 to 255; the report has its own themes.
+COLOURS = {"left": (36, 112, 163), "right": (191, 56, 43), "middle": (90, 90, 90), "path": (51, 179, 77)}
 
 
 def side_of(joint: str, joints: tuple[str, ...]) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.background import Background, read_background
+from drocap_ros.background import FARTHEST_PX, Background, read_background
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.geometry.rotations import MOST_ASPECT, pixels_are_usual
@@ -25,8 +25,6 @@ MAX_BYTES = 4 * 2**30
 #: Arrays of a file: its kinds have some twenty.
 _MOST_ARRAYS = 1000
 _NAMED = 5  # of them in a message
-#: Keypoints beyond it are no pixels, and their squares overflow in the solvers.
-_FARTHEST_PX = 1e9
 #: Keypoints that are all within it are shares of the image, not px.
 _NORMALISED = 2.0
 #: Share of the picture's size beyond its edge at which networks still place joints of a person who is cut off.
@@ -162,8 +160,8 @@ def check_keypoints(keypoints: np.ndarray, covariance: np.ndarray | None) -> Non
     if np.isinf(keypoints).any():
         raise InputError("keypoints: expected finite px or NaN where not seen, got infinity; use NaN")
     for name, unit, values, most in (
-        ("keypoints", "px", keypoints, _FARTHEST_PX),
-        ("covariance", "px^2", covariance, _FARTHEST_PX**2),
+        ("keypoints", "px", keypoints, FARTHEST_PX),
+        ("covariance", "px^2", covariance, FARTHEST_PX**2),
     ):
         large = np.empty(0) if values is None else np.abs(values[np.isfinite(values) & (np.abs(values) > most)])
         if large.size:

@@ -29,7 +29,7 @@ BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
      "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "live_replay"): 4.10,  # points of the scene, everybody in the pictures
-    ("perception",): 6.65,  # points of the scene; one who is followed live, and everybody in a recording
+    ("perception",): 6.45,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 12.75,  # one engine and one camera; paths by fixed points, several recordings, live windows
     ("flight",): 9.25,  # a process that holds after the bridge's death; preflight; heights by every source
     ("recording",): 6.25,  # keypoints of any order (0.45), tables, GPX, GPMF, several in a log; damaged recordings

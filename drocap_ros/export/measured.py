@@ -23,6 +23,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.export.rig import body_of, least_rotation
 from drocap_ros.export.rigid_body import RigidBody
 from drocap_ros.export.take import Take, at_constant_rate, y_up
+from drocap_ros.geometry.alignment import directions
 from drocap_ros.skeleton import TOES
 
 _MM = 1000.0  # in a metre
@@ -171,7 +172,7 @@ def _limb(upper: np.ndarray, lower: np.ndarray, bends: float, rate_hz: float) ->
     The upper bone hangs along -Y and has the smallest rotation, then an axial one that brings the lower bone into the
     plane X Y, towards X times ``bends``; the straighter the limb, the less it is turned.
     """
-    upper, lower = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in (upper, lower))
+    upper, lower = directions(upper), directions(lower)
     axes = least_rotation(np.array([0.0, -1.0, 0.0]), upper, rate_hz).as_matrix()
     bent = bends * _in(axes, lower)
     # Weighted by the squared sine of the flexion, in the complex plane of X and -Z.

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from drocap_ros.errors import InputError
 from drocap_ros.export.rigid_body import BODY, PARENTS, RigidBody, fit_rigid_body
-from drocap_ros.export.take import Take, without_gaps
+from drocap_ros.export.take import ROOT_MOVES_M, Take, without_gaps
+from drocap_ros.geometry.alignment import directions
 from drocap_ros.geometry.rotations import exp_so3, log_so3
 from drocap_ros.skeleton import BODY_15, TOES
 
@@ -47,8 +48,6 @@ _HAND = 0.7
 _CROWN = 0.9  # of neck to head; assumed
 #: Percentile of the lower foot's height that is the floor: the lowest would be an error of one frame.
 _FLOOR_PERCENTILE = 5.0
-#: A root that moves less than this, m, stands still: it has no place in the world.
-_STILL_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def onto_the_floor(body: RigidBody, pelvis: np.ndarray) -> tuple[np.ndarray, str
     ends = TOES if set(TOES) <= set(body.joints) else ("rankle", "lankle")
     soles = [body.at(end)[:, 1] - (0.0 if end in TOES else SOLE * body.lengths[end]) for end in ends]
     lower = np.min(soles, axis=0)
-    if (np.nanmax(pelvis, axis=0) - np.nanmin(pelvis, axis=0)).max() <= _STILL_M:
+    if (np.nanmax(pelvis, axis=0) - np.nanmin(pelvis, axis=0)).max() <= ROOT_MOVES_M:
         lowest = np.minimum(lower, body.positions[..., 1].min(axis=1))
         return -lowest, "no root motion known: in each frame the lowest of soles and joints is on the floor"
     floor = float(np.percentile(lower, _FLOOR_PERCENTILE))
@@ -217,8 +216,7 @@ def _rotations(body: RigidBody, offsets: dict[str, np.ndarray], rate_hz: float) 
         out[joint] = above
         if child is not None:
             rest = offsets[child] / np.linalg.norm(offsets[child])
-            direction = body.at(child) - body.at(joint)
-            direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+            direction = directions(body.at(child) - body.at(joint))
             out[joint] = above * least_rotation(rest, above.inv().apply(direction), rate_hz)
     return out
 

@@ -46,9 +46,8 @@ _PRIORS = ("neck", "lshoulder", "rshoulder")
 _INTERPOLATED = 0.02
 #: A joint farther from its position than this, m, gains weight, so that few joints do not bear a frame's whole misfit.
 FAR_M = 0.02
-#: Most rounds of weighing; the next most steps of one fit: both end before, when the fit has converged.
-_ROUNDS = 20
-_STEPS = 30  # of Levenberg-Marquardt; a judgement
+#: Most rounds of weighing, and steps of one fit: both end before, when it has converged; a judgement.
+_STEPS = 30
 #: Largest change, m or rad, of a fit that has converged; a judgement.
 _CONVERGED = 3e-4
 #: First damping of Levenberg-Marquardt, relative to the diagonal.
@@ -104,7 +103,7 @@ def fit_rigid_body(
     parts = [slice(i, i + _CHUNK) for i in range(0, len(positions), _CHUNK)]
     solved = [problem.solve(start.part(p), measured[p], weights[p]) for p in parts]
     pose = _Pose(*(np.concatenate(values) for values in zip(*solved, strict=True)))
-    for _ in range(_ROUNDS):
+    for _ in range(_STEPS):
         off = np.linalg.norm(problem.observed @ problem.segments(pose) - measured, axis=2) * sure
         far = (off > far_m).any(axis=1)
         if not far.any():

@@ -9,8 +9,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import butter, filtfilt
 
-from drocap_ros.contacts import rest_spans
+from drocap_ros.contacts import SHORTEST_SPAN_S, SPAN_AVERAGE_S, rest_spans
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.alignment import directions
 from drocap_ros.geometry.interpolation import true_runs, usual_step
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.skeleton import indices
@@ -158,18 +159,14 @@ def interpolated(times_s: np.ndarray, positions: np.ndarray, known: np.ndarray) 
 
 #: A filter of order 2 applied twice has its -3 dB at this share of its cut-off.
 _TWICE = (np.sqrt(2.0) - 1.0) ** 0.25
-#: Time (s) over which the direction of a knee is averaged: as that of a foot's velocity (contacts.py).
-_AVERAGE_S = 0.15
-#: Time, s, in which a foot leaves or reaches its place.
-_FADE_S = 0.2
 #: Farther than this, m, from its median place a foot is not at rest.
 _FARTHEST_M = 0.08
 #: Change of a leg's half length per turn of its knee at which half of the turn is made; 0.07 is that of 8 degrees.
 _DAMPING = 0.07
 #: Distance of a knee from the line of its leg at which its direction counts as much as the moments around, m.
 _CLEAR_M = 0.02
-#: A root that moves less than this is not known in the world, m.
-_ROOT_MOVES_M = 0.05
+#: A root that moves less than this stands still: it has no place in the world, m.
+ROOT_MOVES_M = 0.05
 
 
 def smooth(take: Take, cut_off_hz: float) -> Take:
@@ -201,7 +198,7 @@ def lock_feet(take: Take) -> Take:
     """
     pelvis = take.positions[:, indices(take.joints, ("pelvis",))[0]]
     pelvis = pelvis[np.isfinite(pelvis).all(axis=1)]
-    if not len(pelvis) or np.ptp(pelvis, axis=0).max() < _ROOT_MOVES_M:
+    if not len(pelvis) or np.ptp(pelvis, axis=0).max() < ROOT_MOVES_M:
         raise InputError(
             "lock-feet: expected a root that moves through the world, it stands still; reconstruct with telemetry"
         )
@@ -241,7 +238,7 @@ def _offsets(ankle: np.ndarray, rests: list[tuple[int, int]], rate_hz: float) ->
     resting = np.zeros(len(ankle), bool)
     for first, last in rests:
         resting[first:last] = True
-    fade = max(round(_FADE_S * rate_hz), 1)
+    fade = max(round(SHORTEST_SPAN_S * rate_hz), 1)
     ramp = 0.5 * (1.0 + np.cos(np.pi * np.arange(1, fade) / fade))
     for first, last in rests:
         away = np.median(ankle[first:last], axis=0) - ankle[first:last]
@@ -283,8 +280,7 @@ def _two_bones(leg: np.ndarray, target: np.ndarray, rate_hz: float) -> tuple[np.
     foot = (thigh**2 - shank**2 + reach**2) / (2.0 * np.maximum(reach, 1e-9))
     height = np.sqrt(np.maximum(thigh**2 - foot**2, 0.0))
     aside = _aside(knee - hip, ankle - hip, rate_hz)
-    aside = aside - along * np.sum(aside * along, axis=1, keepdims=True)
-    aside /= np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
+    aside = directions(aside - along * np.sum(aside * along, axis=1, keepdims=True))
     moved = np.any(target != ankle, axis=1)[:, None]
     new_knee = hip + along * foot[:, None] + aside * height[:, None]
     return np.where(moved, new_knee, knee), np.where(moved, hip + along * reach[:, None], ankle)
@@ -295,8 +291,8 @@ def _aside(knee: np.ndarray, ankle: np.ndarray, rate_hz: float) -> np.ndarray:
 
     Of a straight leg it is chance: there the bent knees of the moments around count.
     """
-    line = ankle / np.maximum(np.linalg.norm(ankle, axis=1, keepdims=True), 1e-9)
+    line = directions(ankle)
     own = knee - line * np.sum(knee * line, axis=1, keepdims=True)
     around = np.nan_to_num(own) * np.linalg.norm(np.nan_to_num(own), axis=1, keepdims=True)
-    around = gaussian_filter1d(around, min(max(_AVERAGE_S * rate_hz, 1e-3), 1000.0), axis=0)
+    around = gaussian_filter1d(around, min(max(SPAN_AVERAGE_S * rate_hz, 1e-3), 1000.0), axis=0)
     return np.asarray(own + _CLEAR_M * around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-12))

@@ -91,6 +91,11 @@ def unit_or(v: np.ndarray, fallback: np.ndarray) -> np.ndarray:
     return np.where(good, v / np.where(good, norm, 1.0), fallback)
 
 
+def directions(v: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of length 1; 0 of those without length."""
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9))
+
+
 def to_torso_frame(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split poses into body-fixed shapes and the rotation of the body.
 

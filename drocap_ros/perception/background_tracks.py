@@ -100,15 +100,15 @@ def _look(values: np.ndarray) -> np.ndarray:
 
 _SIDE_PX = 1440  # longest side of the images in which patches lie; larger ones are halved until they fit
 _MOST = 160  # points at a time, and cells of the grid: ten times the least number that shows a motion
-_ENOUGH = 80  # of them: with fewer, cells take more than one
+_ENOUGH = _MOST // 2  # of them: with fewer, cells take more than one
 _IN_A_CELL = 3  # most that one takes, and that may gather there as the camera backs off
 _GRADIENT = 2.5  # grey values per px along an edge's own direction, root mean square: sky, water and walls have less
 _FAINT = 1.0  # where an image has too few of these: twice the noise of pictures; concrete and snow have it
-_BLOCK_PX = 5  # over which that is measured, in the image at half the size
+_BLOCK_PX = _REACH  # over which that is measured, in the image at half the size
 #: Least gradient of a corner, and points of its cell with it: in this order, until there are enough.
 _SEARCHES = (*((_GRADIENT, most) for most in range(1, _IN_A_CELL + 1)), (_FAINT, 1))
-_EDGE_PX = 10  # of the image, in which a patch would not fit
-_WINDOW_PX = 11  # of the optical flow around each point, in the image at half the size
+_EDGE_PX = 2 * _REACH  # of the image, in which a patch would not fit
+_WINDOW_PX = 2 * _REACH + 1  # of the optical flow around each point, in the image at half the size
 _COARSEST_PX = 16  # least height or width of the flow's coarsest image: its window has to fit
 _LEVELS = 4  # of the flow's pyramid: steps up to 5 * 2^4 = 80 px of half the size
 _BACK_LEVELS = 1  # of the way back, which begins where the others' motion says,

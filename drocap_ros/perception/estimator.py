@@ -16,9 +16,10 @@ from drocap_ros.perception.load_models import limited_use, load_detector, load_f
 from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.scene import Scene, SceneStep
+from drocap_ros.perception.scene import JITTER_NS, Scene, SceneStep
 from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.tracking.camera_motion import sweeps
+from drocap_ros.perception.tracking.choice import CERTAIN_SCORE
 from drocap_ros.perception.tracking.other_poses import OtherPoses
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Subject
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
@@ -26,8 +27,6 @@ from drocap_ros.perception.tracking.search import SubjectSearch
 from drocap_ros.perception.tracking.subject import SubjectTracker
 from drocap_ros.skeleton import BODY_19
 
-_CLEAR_SCORE = 0.6  # detection score from which the next images need no detection, if the pose is clear
-_SLACK_S = 0.005  # tolerance of the detection interval against jitter of the stamps
 _UNSEEN_NS = 80_000_000  # without detection and believable pose until there are no keypoints: two images at 25 Hz
 _LONGEST_PAUSE = 4  # of the pose network under load shedding, over that after a first failure: 0.4 s at 30 Hz
 
@@ -52,9 +51,9 @@ class PoseEstimator:
         if self.limited_use:
             log.warning("networks in use: %s", self.limited_use)
         self.tracker = SubjectTracker(self.config)
-        self._search = SubjectSearch(self.detector, self.tracker, self.config)
-        self._body = BodyPoseModel(self.pose_model)
-        self._others = OtherPoses(self.tracker, self._body)
+        self.search = SubjectSearch(self.detector, self.tracker, self.config)
+        self.body = BodyPoseModel(self.pose_model)
+        self.others = OtherPoses(self.tracker, self.body)
         self._flow = KeypointFlow()
         self._scene = Scene()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="scene")
@@ -62,7 +61,8 @@ class PoseEstimator:
         self._ahead: tuple[Frame, Future[SceneStep]] | None = None
         #: Boxes of all persons after each of the last two images.
         self._boxes: deque[list[np.ndarray]] = deque([[], []], maxlen=2)
-        self._motion: np.ndarray | None = None
+        #: (2, 3) of the image by the camera's since the last one; None where it is small or unknown.
+        self.motion: np.ndarray | None = None
         self._last_ns: int | None = None
         #: The subject in the last image, if that certainly showed it.
         self._certain: PoseObservation | None = None
@@ -99,28 +99,36 @@ class PoseEstimator:
             clear; from 2 on the scene's points are followed ten times a second
         ahead : the next image, whose scene another thread follows meanwhile; the results are the same without it
         """
+        roi = _validated_roi(roi)
+        scene = self.begin(image, stamp_ns, ahead, seldom=load_level > 1)
+        # A camera that repeats its picture shows nothing new: the bridge knows that by the same keypoints, bit for bit.
+        if scene.again and self._certain is not None and roi is None:
+            observation = dataclasses.replace(self._certain, stamp_ns=stamp_ns)
+        else:
+            observation, certain = self._observe(image, stamp_ns, roi, load_level)
+            self._certain = observation if certain else None
+        self.end()
+        return dataclasses.replace(observation, background=scene.points)
+
+    def begin(self, image: np.ndarray, stamp_ns: int, ahead: Frame | None = None, *, seldom: bool = False) -> SceneStep:
+        """The scene in an image, by which all persons move; the arguments are those of :meth:`process`."""
         _check_image(image)
         if self._last_ns is not None and stamp_ns < self._last_ns:
             log.warning("stamps went back by %.3f s: the tracker restarts", (self._last_ns - stamp_ns) * 1e-9)
             self.tracker.reset()
             self._flow.start(None, None)
-            self._others = OtherPoses(self.tracker, self._body)
             self._margins, self._certain, self._seen_ns = None, None, 0
         self._last_ns = stamp_ns
-        roi = _validated_roi(roi)
-        scene = self._scene_of(image, stamp_ns, ahead, seldom=load_level > 1)
-        # A camera that repeats its picture shows nothing new: the bridge knows that by the same keypoints, bit for bit.
-        if scene.again and self._certain is not None and roi is None:
-            observation = dataclasses.replace(self._certain, stamp_ns=stamp_ns)
-        else:
-            self._motion = scene.motion if self.tracker.persons else None
-            if self._motion is not None:
-                self.tracker.move_camera(self._motion)
-            observation, certain = self._observe(image, stamp_ns, roi, load_level)
-            self._certain = observation if certain else None
+        scene = self._scene_of(image, stamp_ns, ahead, seldom=seldom)
+        self.motion = scene.motion if self.tracker.persons else None
+        if self.motion is not None:
+            self.tracker.move_camera(self.motion)
+        return scene
+
+    def end(self) -> None:
+        """Keep the places of all persons, which are no fixed points of the next image but one."""
         persons = (p for p in self.tracker.persons if not p.pose.value < CONFIRM_CONFIDENCE)
         self._boxes.append([person.box.copy() for person in persons])
-        return dataclasses.replace(observation, background=scene.points)
 
     def _scene_of(self, image: np.ndarray, stamp_ns: int, ahead: Frame | None, *, seldom: bool) -> SceneStep:
         """The scene in this image; that in the next one is begun."""
@@ -161,14 +169,14 @@ class PoseEstimator:
     ) -> tuple[PoseObservation, bool]:
         """The subject by detection, and whether it is certainly a person."""
         shedding = load_level > 0
-        found = self._search.detect(image, stamp_ns, shedding, close=shedding and self._score >= _CLEAR_SCORE)
+        found = self.search.detect(image, stamp_ns, shedding, close=shedding and self._score >= CERTAIN_SCORE)
 
         def look() -> None:
-            self._others.judge(image, stamp_ns, None, self._motion, shedding)
+            self.others.judge(image, stamp_ns, None, self.motion, shedding)
 
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi, look)
         if self._ahead is not None and self._searching and not shedding:
-            self._search.begin(self._ahead[0].image, self._ahead[0].stamp_ns, self._beside)
+            self.search.begin(self._ahead[0].image, self._ahead[0].stamp_ns, self._beside)
         self._searching = True
         if subject is None:
             self._failures = 0
@@ -176,13 +184,13 @@ class PoseEstimator:
         if subject is None:
             return PoseObservation(stamp_ns, 0, _size(image)), False
         if subject.hidden or self._pauses(subject, load_level):
-            return self._observation(image, stamp_ns, subject), False
+            return self.observation(image, stamp_ns, subject), False
         return self._estimate_pose(image, stamp_ns, subject, shedding)
 
     def _pauses(self, subject: Subject, load_level: int) -> bool:
         """Whether the pose network rests under load shedding, after runs without a person and a clear detection."""
         pause = load_level * min(2 ** (self._failures - 1), _LONGEST_PAUSE) if self._failures else 0
-        if subject.score >= _CLEAR_SCORE or self._paused >= pause:
+        if subject.score >= CERTAIN_SCORE or self._paused >= pause:
             return False
         self._paused += 1
         return True
@@ -191,14 +199,14 @@ class PoseEstimator:
         self, image: np.ndarray, stamp_ns: int, subject: Subject, shedding: bool
     ) -> tuple[PoseObservation, bool]:
         """The pose of the detected or predicted subject."""
-        pose = self._body.estimate(image, subject.box)
-        subject, pose = self._others.best(image, stamp_ns, subject, pose, shedding)
+        pose = self.body.estimate(image, subject.box)
+        subject, pose = self.others.best(image, stamp_ns, subject, pose, shedding)
         self.keypoints, self._score, self._confidence = pose.network, subject.score, pose.mean_confidence
         if (around := pose.box()) is not None and self.tracker.is_others(around, stamp_ns):
             self._failures, self._margins = 0, None
-            return self._observation(image, stamp_ns, subject), False
+            return self.observation(image, stamp_ns, subject), False
         self.tracker.judge(self._confidence, subject.box, stamp_ns, pose.limbs())
-        self._others.judge(image, stamp_ns, pose, self._motion, shedding)
+        self.others.judge(image, stamp_ns, pose, self.motion, shedding)
         is_person = self._confidence >= CONFIRM_CONFIDENCE
         self._failures, self._paused = 0 if is_person else self._failures + 1, 0
         detected = subject.score >= self.config.detection_threshold
@@ -208,16 +216,16 @@ class PoseEstimator:
         if is_person or self._is_in_view(subject):
             self._seen_ns = stamp_ns
         elif stamp_ns - self._seen_ns > _UNSEEN_NS:
-            return self._observation(image, stamp_ns, subject), False
-        return self._observation(image, stamp_ns, subject, pose), is_person or detected
+            return self.observation(image, stamp_ns, subject), False
+        return self.observation(image, stamp_ns, subject, pose), is_person or detected
 
     def _is_in_view(self, subject: Subject) -> bool:
         """Whether a detected subject's last pose, doubtful as it is, may be a person's."""
-        return subject.score > 0 and (self._confidence >= EMPTY_CONFIDENCE or sweeps(self._motion, subject.box))
+        return subject.score > 0 and (self._confidence >= EMPTY_CONFIDENCE or sweeps(self.motion, subject.box))
 
     def _clear_margins(self, subject: Subject, pose: BodyPose) -> np.ndarray | None:
         """(4,) margins of the box around the joints, over their longer extent; None unless both are clear."""
-        if subject.score < _CLEAR_SCORE or self._confidence < CLEAR_CONFIDENCE or (extent := pose.extent()) is None:
+        if subject.score < CERTAIN_SCORE or self._confidence < CLEAR_CONFIDENCE or (extent := pose.extent()) is None:
             return None
         margins: np.ndarray = (subject.box - extent) / (extent[2:] - extent[:2]).max()
         return margins
@@ -234,17 +242,17 @@ class PoseEstimator:
         if predicted is None:
             return None
         age_s, every_s = (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
-        shedding = self._confidence >= CLEAR_CONFIDENCE and age_s <= load_level * every_s - _SLACK_S
-        recent = shedding or age_s <= every_s - _SLACK_S
-        alone = recent and self._margins is not None and self._search.isolated(predicted.box, _size(image), stamp_ns)
+        shedding = self._confidence >= CLEAR_CONFIDENCE and age_s <= load_level * every_s - 1e-9 * JITTER_NS
+        recent = shedding or age_s <= every_s - 1e-9 * JITTER_NS
+        alone = recent and self._margins is not None and self.search.isolated(predicted.box, _size(image), stamp_ns)
         if not (alone or shedding):
             return None
-        pose = self._body.estimate(image, predicted.box)
+        pose = self.body.estimate(image, predicted.box)
         subject = self._moved(predicted, pose, _size(image), stamp_ns) if alone else None
         if subject is None and not shedding:
             return None
         self.keypoints, self._confidence = pose.network, pose.mean_confidence
-        return self._observation(image, stamp_ns, subject or predicted, pose), self._confidence >= CONFIRM_CONFIDENCE
+        return self.observation(image, stamp_ns, subject or predicted, pose), self._confidence >= CONFIRM_CONFIDENCE
 
     def _moved(self, subject: Subject, pose: BodyPose, size: tuple[int, int], stamp_ns: int) -> Subject | None:
         """The subject at the box around a clear pose's joints, in the tracker too; None where it is not clear."""
@@ -257,11 +265,11 @@ class PoseEstimator:
         self.tracker.judge(confidence, box, stamp_ns, pose.limbs())
         return Subject(subject.track_id, box, subject.score, False)
 
-    def _observation(
+    def observation(
         self, image: np.ndarray, stamp_ns: int, subject: Subject, pose: BodyPose | None = None
     ) -> PoseObservation:
         """The subject in the image; without a pose, its predicted box without keypoints."""
-        joints, size = BODY_19 if self.feet else self._body.joint_map.joints, _size(image)
+        joints, size = BODY_19 if self.feet else self.body.joint_map.joints, _size(image)
         if pose is not None and self.feet is not None:
             pose = self.feet.add(image, subject.box, pose)
         if pose is None:
@@ -272,7 +280,7 @@ class PoseEstimator:
             # Networks extrapolate beyond the image; nothing there was seen.
             outside = ~((xy >= 0) & (xy < np.array(size))).all(axis=1)
             confidence = np.where(outside, 0.0, pose.confidence)
-            unseen = outside | (confidence < self.config.keypoint_threshold)
+            unseen = outside | (confidence < self.config.keypoint_threshold) | (confidence == 0)
             xy[unseen], covariance[unseen] = np.nan, np.nan
         score = 0.0 if pose is None else subject.score
         box, xy, covariance, confidence = (a.astype(np.float32) for a in (subject.box, xy, covariance, confidence))

@@ -8,7 +8,6 @@ repeatability: median 0.3 to 0.6 % of the box, 1 to 2 % at the 90th percentile.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,22 +16,12 @@ from drocap_ros.perception.models.network_input import shrink
 
 _SIDE_PX = 192  # longer side of the box in the flow's image; smaller boxes are not enlarged
 _MARGIN = 0.25  # around the box, share of its longer side
-_WINDOW_PX = (15, 15)  # of the flow around each joint
+_WINDOW_PX = 15  # of the flow around each joint
 _LEVELS = 2  # of the flow's pyramid: steps up to 7 * 2^2 = 28 px
-_MAX_ERROR = 0.01  # largest forward-backward error of a joint, share of the box's longer side
-_SIGMA = 0.005  # standard deviation that each step adds beside that error, same unit; measured as above
+_SIGMA = 0.005  # standard deviation that each step adds, share of the box's longer side; measured as above
+_MAX_ERROR = 2 * _SIGMA  # largest forward-backward error of a joint, which adds to it, same unit
 _MIN_VALID = 0.5  # least share of valid joints; below it the scene changed or the image is blurred
 _LONGEST_S = 0.1  # between the two images: three of 30 Hz
-
-
-@dataclass(frozen=True)
-class _Reference:
-    """An image's grey region around the subject, and the keypoints in it."""
-
-    observation: PoseObservation
-    region: tuple[int, int, int, int]
-    view: np.ndarray
-    length: float
 
 
 class KeypointFlow:
@@ -45,12 +34,22 @@ class KeypointFlow:
 
     def __init__(self) -> None:
         self.steps = 0
-        self._reference: _Reference | None = None
+        #: Grey region around the subject in the last image, and the keypoints in that.
+        self._reference: tuple[np.ndarray, PoseObservation] | None = None
 
     def start(self, image: np.ndarray | None, observation: PoseObservation | None) -> None:
         """Set the reference: an image (H, W, 3) uint8 BGR and the network's keypoints in it; None = no reference."""
         self.steps = 0
-        self._reference = None if image is None or observation is None else _reference(image, observation)
+        self._keep(image, observation)
+
+    def _keep(self, image: np.ndarray | None, observation: PoseObservation | None) -> None:
+        """Reference for the next image; None without keypoints or with a box too small for the flow's window."""
+        self._reference = None
+        if image is None or observation is None or not np.isfinite(observation.keypoints).any():
+            return
+        region, length = _around(observation)
+        if observation.has_subject and (region[2:] - region[:2]).min() > 2 * _WINDOW_PX:
+            self._reference = _view(image, region, length), observation
 
     def propagate(self, image: np.ndarray, stamp_ns: int) -> PoseObservation | None:
         """The same subject in the next image; None without a reference or with too few valid joints.
@@ -58,22 +57,21 @@ class KeypointFlow:
         Invalid joints are NaN, and the box moves with the others.  Covariances grow by the flow's error; scores and
         confidences stay.
         """
-        reference = self._reference
         size = (image.shape[1], image.shape[0])
-        if reference is None or size != reference.observation.image_size:
+        if self._reference is None or size != self._reference[1].image_size:
             return None
-        before = reference.observation
+        last, before = self._reference
         if not 0 < (stamp_ns - before.stamp_ns) * 1e-9 <= _LONGEST_S:
             return None
         known = np.isfinite(before.keypoints).all(axis=1)
-        view = _view(image, reference.region, reference.length)
-        origin = np.array(reference.region[:2], float)
-        scale = np.array([view.shape[1], view.shape[0]]) / (np.array(reference.region[2:]) - origin)
-        start = ((before.keypoints[known] - origin) * scale).astype(np.float32)
-        forward, found = _flow(reference.view, view, start)
-        backward, found_backward = _flow(view, reference.view, forward)
-        error = np.linalg.norm((backward - start) / scale, axis=1) / reference.length
-        moved = forward / scale + origin
+        region, length = _around(before)
+        view = _view(image, region, length)
+        scale = np.array([view.shape[1], view.shape[0]]) / (region[2:] - region[:2])
+        start = ((before.keypoints[known] - region[:2]) * scale).astype(np.float32)
+        forward, found = _flow(last, view, start)
+        backward, found_backward = _flow(view, last, forward)
+        error = np.linalg.norm((backward - start) / scale, axis=1) / length
+        moved = forward / scale + region[:2]
         valid = found & found_backward & (error <= _MAX_ERROR) & ((moved >= 0) & (moved < size)).all(axis=1)
         if valid.sum() < _MIN_VALID * known.sum():
             return None
@@ -82,7 +80,7 @@ class KeypointFlow:
         covariance = np.full_like(before.covariance, np.nan)
         confidence = np.zeros_like(before.confidence)
         keypoints[joints] = moved[valid]
-        variance = ((_SIGMA**2 + error[valid] ** 2) * reference.length**2)[:, None]
+        variance = ((_SIGMA**2 + error[valid] ** 2) * length**2)[:, None]
         covariance[joints] = before.covariance[joints] + variance * np.array([1.0, 0.0, 1.0])
         confidence[joints] = before.confidence[joints]
         shift = np.median(keypoints[joints] - before.keypoints[joints], axis=0)
@@ -97,37 +95,34 @@ class KeypointFlow:
             space=None,
         )
         self.steps += 1
-        self._reference = _reference(image, observation)
+        self._keep(image, observation)
         return observation
 
 
-def _reference(image: np.ndarray, observation: PoseObservation) -> _Reference | None:
-    """Reference for the next image; None without keypoints or with a box too small for the flow's window."""
-    if not observation.has_subject or not np.isfinite(observation.keypoints).any():
-        return None
+def _around(observation: PoseObservation) -> tuple[np.ndarray, float]:
+    """(4,) px of the region around the subject, whole numbers, and the longer side of its box."""
     box = observation.roi.astype(float)
     length = float((box[2:] - box[:2]).max())
     low = np.clip(np.floor(box[:2] - _MARGIN * length), 0, None)
     high = np.minimum(np.ceil(box[2:] + _MARGIN * length), observation.image_size)
-    if (high - low).min() <= 2 * max(_WINDOW_PX):
-        return None
-    region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-    return _Reference(observation, region, _view(image, region, length), length)
+    return np.concatenate([low, high]), length
 
 
 def _flow(view: np.ndarray, later: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 2) float32 px in the later view, and whether they were found (N,)."""
     import cv2
 
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(view, later, points, points.copy(), winSize=_WINDOW_PX, maxLevel=_LEVELS)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        view, later, points, points.copy(), winSize=(_WINDOW_PX, _WINDOW_PX), maxLevel=_LEVELS
+    )
     return np.asarray(moved), np.asarray(found)[:, 0] == 1
 
 
-def _view(image: np.ndarray, region: tuple[int, int, int, int], length: float) -> np.ndarray:
+def _view(image: np.ndarray, region: np.ndarray, length: float) -> np.ndarray:
     """The region in grey, scaled so that the person is at most ``_SIDE_PX`` long."""
     import cv2
 
-    x0, y0, x1, y1 = region
+    x0, y0, x1, y1 = region.astype(int)
     grey = cv2.cvtColor(image[y0:y1, x0:x1], cv2.COLOR_BGR2GRAY)
     scale = min(1.0, _SIDE_PX / length)
     return shrink(grey, (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))))

@@ -11,11 +11,10 @@ from drocap_ros.background import FixedPoints
 from drocap_ros.perception.background_tracks import BackgroundTracks
 from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box
 
+JITTER_NS = 5_000_000  # by which an image may come earlier than at its rate
 _COMPARED_ROWS = 4  # every so many rows tell whether an image is the last one again,
-_SELDOM_NS = (
-    95_000_000  # between two steps of a machine that is too slow, whose camera does not pan: 10 Hz, with jitter
-)
 _FIRST_ROWS = 64  # and every so many of them, compared first, mostly that it is not
+_SELDOM_NS = 100_000_000 - JITTER_NS  # between two steps of a machine that is too slow, whose camera does not pan
 
 
 class SceneStep(NamedTuple):

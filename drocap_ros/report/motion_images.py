@@ -81,11 +81,9 @@ _STEPS = tuple((share, quality) for share in (1, 2, 4) for quality in (75, 60, 4
 _GROWTH = 1.12
 #: Most images that are kept while their poses are found, 60 MB: the report of a longer recording reads it again.
 _MOST_KEPT = 3000
-#: Tolerances of the checks whether images belong to a motion: their number (re-encoding loses a few), their rate, and
-#: the share of keypoints outside of them.
-_LENGTH_SHARE = 0.02
-_RATE_SHARE = 0.03  # share; a judgement
-_OUTSIDE_SHARE = 0.05  # share; a judgement: networks place a few joints beyond the edge
+#: Tolerance of the checks whether images belong to a motion: their number (re-encoding loses a few), their rate, and
+#: the share of keypoints outside of them (networks place a few joints beyond the edge); a judgement.
+_OTHERWISE = 0.03
 
 
 @dataclass(frozen=True)
@@ -244,8 +242,8 @@ def _check_times(path: Path, images: Images, motion: Shown) -> None:
     """Refuse images of another number or rate than ``meta`` states, or else that cannot be at the motion's times."""
     stated = _stated(motion, "images")
     for expected, got, share, slack, words in (
-        (stated.get("length"), images.length, _LENGTH_SHARE, 1, "images"),
-        (stated.get("rate_hz"), images.rate_hz, _RATE_SHARE, 0, "images per second"),
+        (stated.get("length"), images.length, _OTHERWISE, 1, "images"),
+        (stated.get("rate_hz"), images.rate_hz, _OTHERWISE, 0, "images per second"),
     ):
         if isinstance(expected, int | float) and got and abs(got - expected) > share * expected + slack:
             raise _other(path, f"{expected:.4g} {words}", f"{got:.4g}")
@@ -259,7 +257,7 @@ def _check_span(path: Path, images: Images, motion: Shown) -> None:
         return
     step_s = usual_step(motion.stamp_ns) * 1e-9
     ratio = step_s * images.rate_hz  # images per frame of the motion
-    if ratio < 0.5 or abs(ratio - round(ratio)) > _RATE_SHARE * ratio:
+    if ratio < 0.5 or abs(ratio - round(ratio)) > _OTHERWISE * ratio:
         raise _other(path, f"{1 / step_s:.4g} images per second or a multiple", f"{images.rate_hz:.4g}")
     length_ns = int(motion.stamp_ns[-1] - motion.stamp_ns[0])
     if length_ns > 1e9 * images.duration_s + _slack_ns(length_ns):
@@ -281,7 +279,7 @@ def _check_size(path: Path, width: int, height: int, motion: Shown) -> None:
         return
     known = motion.keypoints[np.isfinite(motion.keypoints).all(axis=2)]
     outside = float(((known < 0) | (known > (width, height))).any(axis=1).mean()) if len(known) else 0.0
-    if outside > _OUTSIDE_SHARE:
+    if outside > _OTHERWISE:
         raise _other(path, "its keypoints inside the images", f"{outside:.0%} of them outside {width}x{height} px")
 
 
@@ -342,7 +340,7 @@ def _clock_offset_ns(motion: Shown, first_ns: int, duration_s: float | None, hal
 
 def _slack_ns(length_ns: int) -> int:
     """Greatest excess of a motion's length over the stated one of its images: rates in containers are rounded."""
-    return max(500_000_000, round(_LENGTH_SHARE * length_ns))
+    return max(500_000_000, round(_OTHERWISE * length_ns))
 
 
 class _Encoder:

@@ -9,7 +9,7 @@ import numpy as np
 
 from drocap_ros.contacts import speed_of_lowest
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.alignment import torso_frame
+from drocap_ros.geometry.alignment import directions, torso_frame
 from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
 from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
@@ -253,7 +253,7 @@ def _knees(joints: np.ndarray, motion: Motion, forward: np.ndarray) -> tuple[flo
         hip, knee, ankle = np.moveaxis(
             joints[:, indices(motion.joints, (f"{side}hip", f"{side}knee", f"{side}ankle"))], 1, 0
         )
-        thigh, shank = _unit(knee - hip), _unit(ankle - knee)
+        thigh, shank = directions(knee - hip), directions(ankle - knee)
         # The knee lies off the line from hip to ankle, in the direction of thigh minus shank.
         judged = np.degrees(np.arccos(np.clip(np.sum(thigh * shank, axis=1), -1.0, 1.0))) > _BENT_DEG
         bent += int(judged.sum())
@@ -275,7 +275,3 @@ def _path_speeds(motion: Motion, times_s: np.ndarray) -> tuple[float, float]:
     step_s = np.diff(times_s)
     pelvis = np.linalg.norm(np.diff(at[:, 0, :2], axis=0) / step_s[:, None], axis=1)
     return speed_of_lowest(at[:, 1:], step_s), float(np.median(pelvis))
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))

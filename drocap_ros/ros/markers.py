@@ -18,7 +18,7 @@ from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.recording.session import Message
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros, transform_to_ros
 from drocap_ros.ros.topics import KEPT_QOS
-from drocap_ros.skeleton import SIDE_COLOURS, JointSet, joint_set, side_of
+from drocap_ros.skeleton import COLOURS, JointSet, joint_set, side_of
 
 try:
     import hri_msgs.msg as hri
@@ -146,9 +146,8 @@ class HumanTopics:
             self._own[-1].publish(String(data=body))
 
 
-#: Colours, red, green, blue and opacity from 0 to 1: a joint is seen through its ellipsoid; a judgement.
-_UNCERTAIN = (0.95, 0.75, 0.1, 0.25)
-_PATH = (0.2, 0.7, 0.3, 0.9)  # likewise
+#: Of ellipsoids, through which a joint is seen.
+_UNCERTAIN = ColorRGBA(r=0.95, g=0.75, b=0.1, a=0.25)
 #: Ellipsoids show two standard deviations.
 _SIGMAS = 2.0
 
@@ -190,7 +189,7 @@ def _ellipsoids(message: Pose3D, joints: np.ndarray, known: np.ndarray) -> list[
         ball = _marker(message.header, "uncertainty", Marker.SPHERE, int(number))
         ball.pose = Pose(position=_point(joints[number]), orientation=quaternion_to_ros(xyzw))
         ball.scale = Vector3(x=float(size[0]), y=float(size[1]), z=float(size[2]))
-        ball.color = _colour(*_UNCERTAIN)
+        ball.color = _UNCERTAIN
         markers.append(ball)
     return markers
 
@@ -199,7 +198,7 @@ def path_marker(header: Header, positions: np.ndarray) -> Marker:
     """Path of the camera (N, 3) m in the header's frame, as a line."""
     line = _marker(header, "camera_path", Marker.LINE_STRIP)
     line.scale.x = 0.04
-    line.color = _colour(*_PATH)
+    line.color = _colour("path")
     line.points = [_point(p) for p in positions]
     return line
 
@@ -218,7 +217,7 @@ def keypoint_marker(message: Pose2D) -> ImageMarker:
     known = np.isfinite(points).all(axis=1)
     size = max(2.0, 0.004 * max(observation.image_size))
     marker.scale = float(max(1.0, 0.4 * size))
-    marker.outline_color = _colour_of("middle")
+    marker.outline_color = _colour("middle")
     for bone in joints_of.bones:
         if known[bone].all():
             _line(marker, points[bone[0]], points[bone[1]], _side_colour(joints_of, int(bone[1])))
@@ -248,21 +247,17 @@ def body_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformSt
 def _marker(header: Header, namespace: str, kind: int, number: int = 0) -> Marker:
     marker = Marker(header=header, ns=namespace, id=number, type=kind, action=Marker.ADD)
     marker.pose.orientation = Quaternion(w=1.0)
-    marker.color = _colour_of("middle")
+    marker.color = _colour("middle")
     return marker
 
 
 def _side_colour(joints: JointSet, joint: int) -> ColorRGBA:
-    return _colour_of(side_of(joints.joints[joint], joints.joints))
+    return _colour(side_of(joints.joints[joint], joints.joints))
 
 
-def _colour_of(side: str) -> ColorRGBA:
-    red, green, blue = (part / 255.0 for part in SIDE_COLOURS[side])
-    return _colour(red, green, blue, 1.0)
-
-
-def _colour(red: float, green: float, blue: float, alpha: float) -> ColorRGBA:
-    return ColorRGBA(r=red, g=green, b=blue, a=alpha)
+def _colour(of: str) -> ColorRGBA:
+    red, green, blue = (part / 255.0 for part in COLOURS[of])
+    return ColorRGBA(r=red, g=green, b=blue, a=1.0)
 
 
 def _point(p: np.ndarray) -> Point:

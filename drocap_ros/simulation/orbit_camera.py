@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from drocap_ros.geometry.alignment import directions
+
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
     """(F, 3, 3) world (ENU) -> camera (x right, y down, z forward), level, from position towards target (F, 3) m.
 
     A camera straight above or below its target has no level; its right is then world x.
     """
-    forward = target - position
-    forward = forward / np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
+    forward = directions(target - position)
     right = np.stack([forward[:, 1], -forward[:, 0], np.zeros(len(forward))], axis=1)
     length = np.linalg.norm(right, axis=1, keepdims=True)
     right = np.where(length > 1e-6, right / np.maximum(length, 1e-6), np.array([1.0, 0.0, 0.0]))

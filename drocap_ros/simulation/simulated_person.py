@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.alignment import directions
 from drocap_ros.skeleton import BODY_15, BODY_17, JointSet
 
 #: From the ankle to the tip of the big toe, share of the stature.
@@ -43,22 +44,18 @@ def add_toes(joints: np.ndarray, heading: np.ndarray, stature_m: float) -> np.nd
         ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
         drop = np.clip((ankle[:, 2] - TOE_HEIGHT_M) / length, 0.0, 0.95)
         ground = np.sqrt(1 - drop**2)[:, None] * ahead - drop[:, None] * (0.0, 0.0, 1.0)
-        shank = _unit(ankle - knee)
-        free = _unit(ahead - np.sum(ahead * shank, axis=1, keepdims=True) * shank)
+        shank = directions(ankle - knee)
+        free = directions(ahead - np.sum(ahead * shank, axis=1, keepdims=True) * shank)
         lifted = np.clip((ankle[:, 2] / length - _LEAVES) / (_FREE - _LEAVES), 0.0, 1.0)
         share = (lifted**2 * (3 - 2 * lifted))[:, None]
-        way = _unit((1 - share) * ground + share * free)
+        way = directions((1 - share) * ground + share * free)
         # No toe enters the ground.
         lowest = (TOE_HEIGHT_M - ankle[:, 2]) / length
         low = way[:, 2] < lowest
-        flat = _unit(way * (1, 1, 0)) * np.sqrt(np.maximum(1 - np.minimum(lowest, 0.0) ** 2, 0.0))[:, None]
+        flat = directions(way * (1, 1, 0)) * np.sqrt(np.maximum(1 - np.minimum(lowest, 0.0) ** 2, 0.0))[:, None]
         way[low] = (flat + np.minimum(lowest, 0.0)[:, None] * (0.0, 0.0, 1.0))[low]
         toes.append(ankle + length * way)
     return np.concatenate([joints, np.stack(toes, axis=1)], axis=1)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
 
 
 _SINGLE = ("walk", "boxing", "kicking", "squats")
@@ -261,8 +258,7 @@ def two_bone(
     reach = np.clip(distance, 0.3 * (first_m + second_m), 0.998 * (first_m + second_m))
     along = (first_m**2 - second_m**2 + reach**2) / (2 * reach)
     height = np.sqrt(np.maximum(first_m**2 - along**2, 0.0))
-    side = pole - np.sum(pole * direction, axis=1, keepdims=True) * direction
-    side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    side = directions(pole - np.sum(pole * direction, axis=1, keepdims=True) * direction)
     return start + along * direction + height * side, start + reach * direction
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
-from drocap_ros.skeleton import SIDE_COLOURS, JointSet, side_of
+from drocap_ros.skeleton import COLOURS, JointSet, side_of
 
 if TYPE_CHECKING:
     import rerun
@@ -194,8 +194,6 @@ PLOTS = ("reprojection_px", "confidence")
 
 _OPACITY = 200
 _WIDTH_M = 0.012
-_CURVE = (36, 112, 163)
-_PATH = (51, 179, 77)
 _BACKGROUND = (238, 240, 243)
 
 
@@ -251,7 +249,7 @@ class Scene:
     def calibration(self, camera_matrix: np.ndarray, size: tuple[int, int]) -> None:
         """Camera matrix (3, 3) px of the following images of a size (width, height)."""
         pinhole = self._rr.Pinhole(
-            image_from_camera=camera_matrix, resolution=size, image_plane_distance=1.0, color=_PATH
+            image_from_camera=camera_matrix, resolution=size, image_plane_distance=1.0, color=COLOURS["path"]
         )
         self._log(IMAGE, pinhole)
 
@@ -261,7 +259,7 @@ class Scene:
 
     def camera_path(self, positions: np.ndarray) -> None:
         """Path (N, 3) m of the camera so far."""
-        self._log(CAMERA_PATH, self._rr.LineStrips3D([positions], colors=_PATH, radii=0.01))
+        self._log(CAMERA_PATH, self._rr.LineStrips3D([positions], colors=COLOURS["path"], radii=0.01))
 
     def plot(self, name: str, value: float) -> None:
         """One value of a curve ``group/name``; NaN is not drawn."""
@@ -270,7 +268,7 @@ class Scene:
         last = name.rsplit("/", 1)[-1]
         if name not in self._curves:
             self._curves.add(name)
-            self._log(f"plots/{name}", self._rr.SeriesLines(names=last, colors=_CURVE), static=True)
+            self._log(f"plots/{name}", self._rr.SeriesLines(names=last, colors=COLOURS["left"]), static=True)
         self._log(f"plots/{name}", self._rr.Scalars(value))
 
     def _log(self, path: str, entity: rerun.AsComponents, static: bool = False) -> None:
@@ -278,7 +276,7 @@ class Scene:
 
 
 def _joint_colours(joints_of: JointSet, opacity: int) -> np.ndarray:
-    rows = [(*SIDE_COLOURS[side_of(joint, joints_of.joints)], opacity) for joint in joints_of.joints]
+    rows = [(*COLOURS[side_of(joint, joints_of.joints)], opacity) for joint in joints_of.joints]
     return np.array(rows, np.uint8)
 
 

@@ -178,7 +178,7 @@ def pose_sample(world: World, rng: np.random.Generator, degraded: bool = True) -
     half = 0.5 * extent * np.exp(rng.normal(0, 0.09, 2))
     guess = np.concatenate([middle - half, middle + half])
     crop = crop_around(guess, POSE_SIZE, POSE_PADDING)
-    at = (px + 0.5 - np.array(crop.centre)) * crop.scale + np.array(POSE_SIZE) / 2 - 0.5
+    at = (px - np.array(crop.origin)) * crop.scale + np.array(crop.offset)
     seen = px_inside & (at > -0.5).all(axis=1) & (at < np.array(POSE_SIZE) - 0.5).all(axis=1)
     return PoseSample(cut(image, crop), at.astype(np.float32), seen, float(extent.max() * crop.scale))
 

@@ -75,7 +75,7 @@ def test_clear_subject_is_detected_when_due_and_propagated_in_between(
     poses = counted(monkeypatch, estimator.pose_model, "estimate")
     work = ""
     for i in range(1, len(expected) + 1):
-        monkeypatch.setattr(estimator._search, "isolated", lambda *_: False)
+        monkeypatch.setattr(estimator.search, "isolated", lambda *_: False)
         before = len(detections), len(poses)
         observation = estimator.process(grainy(images[0], i), i * STEP_NS, load_level=load_level)
         assert observation.track_id == 1
@@ -175,7 +175,7 @@ def test_doubtful_keypoints_without_a_detection_are_not_propagated(estimator, im
     assert estimator.propagated
     nobody = Detections(np.empty((0, 4), np.float32), np.empty(0, np.float32))
     monkeypatch.setattr(estimator.detector, "detect", lambda *_: nobody)
-    body, estimate = estimator._body, estimator._body.estimate
+    body, estimate = estimator.body, estimator.body.estimate
     monkeypatch.setattr(body, "estimate", lambda *a: (pose := estimate(*a))._replace(confidence=0.4 * pose.confidence))
     propagated = []
     for i in range(4, 19):

@@ -3,24 +3,17 @@
 import contextlib
 import signal
 import time
-from array import array
 
-import numpy as np
 import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 
-from drocap_ros.bringup import bringup
-from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import ParameterError
-from drocap_ros.keypoints import PoseObservation
 from drocap_ros.nodes.initializer import InitializerNode
 from drocap_ros.reconstruction.common.config import InitializerConfig
-from drocap_ros.ros.conversions import pose2d_to_ros
-from drocap_ros.ros.diagnostics import Key, values_of
+from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
-from drocap_ros.simulation.capture import simulate_capture
 
 
 @contextlib.contextmanager
@@ -66,52 +59,6 @@ def test_override_takes_precedence_over_the_configuration(context):
 def test_override_outside_its_range_is_refused_at_construction(context, name, value):
     with pytest.raises(ParameterError, match=name), initializer(context, **{name: value}):
         pass
-
-
-def test_malformed_messages_are_counted_and_the_next_good_one_is_processed():
-    capture = simulate_capture(0.2, 10.0, seed=0).tracks
-    good = pose2d_to_ros(
-        PoseObservation(
-            1_000_000_000,
-            1,
-            capture.image_size,
-            keypoints=capture.keypoints[0].astype(np.float32),
-            covariance=capture.covariance[0].astype(np.float32),
-            confidence=capture.confidence[0].astype(np.float32),
-        ),
-        "camera",
-    )
-    bad = []
-    for name, value in (
-        ("keypoints", array("f", [1.0] * 29)),
-        ("keypoints", array("f", [float("inf")] * 30)),
-        ("keypoints", array("f", [0.0] * 100_000)),
-        ("covariance", array("f")),
-        ("covariance", array("f", [-1.0] * 45)),
-        ("skeleton", "octopus"),
-        ("image_width", 0),
-    ):
-        message = pose2d_to_ros(PoseObservation(1, 1, (640, 480)), "camera")
-        for field in ("header", "skeleton", "image_width", "image_height", "keypoints", "covariance", "confidence"):
-            setattr(message, field, getattr(good, field))
-        setattr(message, name, value)
-        bad.append(message)
-    with bringup(DrocapConfig(), ["initializer"]) as graph:
-        poses, reports = [], []
-        graph.node.create_subscription(TOPICS["pose3d/initial"].message, "pose3d/initial", poses.append, RESULT_QOS)
-        graph.node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", reports.append, RESULT_QOS)
-        publisher = graph.node.create_publisher(TOPICS["pose2d"].message, "pose2d", RESULT_QOS)
-        graph.wait_until(publisher.get_subscription_count, 20, "the node to listen")
-        for message in [*bad, good]:
-            publisher.publish(message)
-        graph.wait_until(lambda: poses, 20, "a pose from the good message")
-
-        def counted():
-            values = [values_of(m.status[0]) for m in reports]
-            return any(v.get(Key.MESSAGES_REFUSED) == str(len(bad)) for v in values)
-
-        graph.wait_until(counted, 20, "the refusals on /diagnostics")
-    assert len(poses) == 1
 
 
 def spin_until_ready(context, node, seconds):

@@ -58,8 +58,8 @@ def test_an_image_without_a_subject_is_a_message_with_empty_arrays():
         ("keypoints", array("f", [0.0] * 1_000_000), "keypoints: expected 30 values"),
         ("covariance", array("f"), "covariance: expected 45"),
         ("confidence", array("f", [1.0]), "confidence: expected 15"),
-        ("keypoints", array("f", [1e30] * 30), r"at most 1e\+09 px"),
-        ("covariance", array("f", [1e30] * 45), r"at most 1e\+18 px\^2"),
+        ("keypoints", array("f", [1e30] * 30), r"at most 1e\+06 px"),
+        ("covariance", array("f", [1e30] * 45), r"at most 1e\+12 px\^2"),
         ("image_width", 0, "image size"),
     ],
 )

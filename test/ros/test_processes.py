@@ -9,10 +9,6 @@ from pathlib import Path
 import pytest
 from captured_flight import captured_config
 
-from drocap_ros.config import DrocapConfig
-from drocap_ros.errors import InputError
-from drocap_ros.ros.processes import LaunchContext, NodeProcess
-
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -50,18 +46,3 @@ def test_nodes_stop_when_the_process_that_started_them_is_killed(tmp_path):
     while any(name_of(pid) for pid in pids) and time.monotonic() < end:
         time.sleep(0.1)
     assert not any(name_of(pid) for pid in pids)
-
-
-def run_until_it_ends(node):
-    end = time.monotonic() + 20.0
-    while time.monotonic() < end:
-        node.check()
-        time.sleep(0.1)
-
-
-def test_refused_parameter_of_a_node_is_the_error_of_its_process(tmp_path, monkeypatch):
-    section = {"/**/initializer": {"ros__parameters": {"gap_s": -1.0}}}
-    monkeypatch.setattr(DrocapConfig, "to_parameter_file", lambda _: section)
-    node = NodeProcess("initializer", DrocapConfig(), LaunchContext(["initializer"], "/drocap", 101, tmp_path))
-    with pytest.raises(InputError, match="gap_s"):
-        run_until_it_ends(node)

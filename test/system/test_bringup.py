@@ -6,7 +6,6 @@ import stat
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -19,11 +18,9 @@ from sensor_msgs.msg import Image
 from drocap_ros.bringup import bringup, free_domain, lockstep, node_class
 from drocap_ros.config import DrocapConfig, section_types
 from drocap_ros.errors import InputError
-from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow
+from drocap_ros.msg import Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.topics import NODES, TOPICS
-from drocap_ros.simulation.vehicle.loopback import free_udp_port
-from drocap_ros.srv import OrbitCommand
 
 CAPTURE = ["session_player", "initializer", "bundle_adjuster"]
 
@@ -185,28 +182,3 @@ def test_readme_s_example_runs_as_printed(root, tmp_path):
     command = [sys.executable, "example.py"]
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-
-
-def test_two_graphs_side_by_side_receive_their_own_messages_only(tmp_path):
-    with ExitStack() as stack:
-        graphs = [stack.enter_context(bringup(short_flight(tmp_path, 2.0, seed), CAPTURE[:2])) for seed in (0, 1)]
-        assert graphs[0].domain_id != graphs[1].domain_id
-        got = [collect(graph, "pose2d") for graph in graphs]
-        for graph in graphs:
-            graph.wait_finished("session_player", timeout_s=60)
-    first, second = (np.array([m.keypoints for m in g["pose2d"]]) for g in got)
-    assert len(first) == len(second) == 30
-    assert not np.array_equal(first, second)
-
-
-def test_bridge_without_permission_refuses_to_start_an_orbit():
-    config = DrocapConfig().replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
-    with bringup(config, ["mavlink_bridge"]) as graph:
-        got = collect(graph, "orbit/status")
-        client = graph.node.create_client(OrbitCommand, "orbit/command")
-        graph.wait_until(client.service_is_ready, 20, "the bridge's service")
-        answer = client.call_async(OrbitCommand.Request(command=OrbitCommand.Request.START))
-        graph.wait_until(answer.done, 20, "an answer")
-        assert not answer.result().accepted
-        graph.wait_until(lambda: got["orbit/status"], 20, "a status")
-    assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}

@@ -3,7 +3,6 @@
 from contextlib import ExitStack
 
 import numpy as np
-import pytest
 from captured_flight import captured_config
 
 from drocap_ros.bringup import bringup, free_domain
@@ -13,19 +12,15 @@ NODES = ["session_player", "initializer", "bundle_adjuster", "visualizer", "sess
 DRONES = ("drone1", "drone10")  # one name begins with the other
 
 
-@pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
-def test_graphs_in_two_namespaces_receive_their_own_messages_only(tmp_path, monkeypatch, processes):
+def test_graphs_in_two_namespaces_receive_their_own_messages_only(tmp_path, monkeypatch):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with free_domain() as domain, ExitStack() as stack:
         graphs = []
         for seed, drone in enumerate(DRONES):
             config = captured_config(tmp_path, 2.0, rate_hz=10.0, seed=seed)
             config = config.replace("session_recorder", session_dir=str(tmp_path / drone))
-            graphs.append(
-                stack.enter_context(
-                    bringup(config, NODES, processes=processes, namespace=f"/{drone}", domain_id=domain)
-                )
-            )
+            place = {"namespace": f"/{drone}", "domain_id": domain}
+            graphs.append(stack.enter_context(bringup(config, NODES, processes=True, **place)))
         for graph in graphs:
             graph.wait_finished("session_player", timeout_s=60)
             graph.spin_for(1.5)  # one more status of each node

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,12 +15,23 @@ from drocap_ros.perception.models.runtime import Model
 from drocap_ros.perception.models.spec import ModelSpec, grid_centres, map_grid
 
 
-class RawDetections(NamedTuple):
-    """boxes (N, 4) x_min y_min x_max y_max in input px, scores (N,), keypoints (N, P, 3) x y score or None."""
+@dataclass(frozen=True)
+class Detections:
+    """Persons in an image, by falling score, or in a network's input.
+
+    boxes : (N, 4) float32 px, x_min y_min x_max y_max, clipped to the image
+    scores : (N,) float32 in [0, 1]
+    keypoints : (N, P, 3) x y score, of an input alone; None = the network gives none
+    appearances : N descriptors, of those that a tracker assigns
+    """
 
     boxes: np.ndarray
     scores: np.ndarray
     keypoints: np.ndarray | None = None
+    appearances: Sequence[np.ndarray | None] = ()
+
+    def __len__(self) -> int:
+        return len(self.scores)
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -45,7 +55,7 @@ def _points(rows: np.ndarray, spec: ModelSpec) -> np.ndarray | None:
     return rows.reshape(len(rows), -1, 3) if spec.skeleton else None
 
 
-def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> Detections:
     """RTMDet's raw maps: class logits and distances l t r b (px) from each cell's corner.
 
     Per stride either one map, classes first, or a class map and a distance map; NHWC or NCHW.
@@ -66,10 +76,10 @@ def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) ->
         d = joined[rows, columns, -4:]
         boxes.append(np.concatenate([corner - d[:, :2], corner + d[:, 2:]], axis=1))
         scores.append(score[rows, columns])
-    return RawDetections(np.concatenate(boxes), np.concatenate(scores))
+    return Detections(np.concatenate(boxes), np.concatenate(scores))
 
 
-def yolox_grid(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+def yolox_grid(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> Detections:
     """YOLOX's grid: cx cy w h, objectness, classes; centres in cells and log sizes unless ``spec.decoded``."""
     rows = _flat(outputs[0])
     score = rows[:, 4] * rows[:, 5 + spec.person_class]
@@ -80,34 +90,34 @@ def yolox_grid(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> 
         corners, stride = grid_centres(spec.input_size, strides)
         s = stride[keep, None]
         boxes = np.concatenate([boxes[:, :2] * s + corners[keep], np.exp(np.clip(boxes[:, 2:], -10, 10)) * s], axis=1)
-    return RawDetections(_corners(boxes), score[keep])
+    return Detections(_corners(boxes), score[keep])
 
 
-def boxes_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+def boxes_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> Detections:
     """Model with suppression: x_min y_min x_max y_max score; a second output holds class labels or keypoints."""
     rows = _flat(outputs[0])
     keep = rows[:, 4] >= threshold
     if len(outputs) > 1 and not spec.skeleton:
         keep &= outputs[1].reshape(-1) == spec.person_class
     keypoints = _points(outputs[1].reshape(len(rows), -1)[keep], spec) if spec.skeleton else None
-    return RawDetections(rows[keep, :4], rows[keep, 4], keypoints)
+    return Detections(rows[keep, :4], rows[keep, 4], keypoints)
 
 
-def yolo_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+def yolo_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> Detections:
     """Model with suppression, one output: x_min y_min x_max y_max score class (and keypoints x y score)."""
     rows = _flat(outputs[0])
     rows = rows[(rows[:, 4] >= threshold) & (np.round(rows[:, 5]) == spec.person_class)]
-    return RawDetections(rows[:, :4], rows[:, 4], _points(rows[:, 6:], spec))
+    return Detections(rows[:, :4], rows[:, 4], _points(rows[:, 6:], spec))
 
 
-def yolo(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+def yolo(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> Detections:
     """YOLO without objectness, channels first: cx cy w h, classes; or one class and keypoints x y score."""
     rows = _flat(outputs[0]).T
     rows = rows[rows[:, 4 + spec.person_class] >= threshold]
-    return RawDetections(_corners(rows[:, :4]), rows[:, 4 + spec.person_class], _points(rows[:, 5:], spec))
+    return Detections(_corners(rows[:, :4]), rows[:, 4 + spec.person_class], _points(rows[:, 5:], spec))
 
 
-DECODERS: dict[str, Callable[[list[np.ndarray], ModelSpec, float], RawDetections]] = {
+DECODERS: dict[str, Callable[[list[np.ndarray], ModelSpec, float], Detections]] = {
     "rtmdet-maps": rtmdet_maps,
     "yolox-grid": yolox_grid,
     "boxes-nms": boxes_nms,
@@ -121,21 +131,6 @@ DECODERS: dict[str, Callable[[list[np.ndarray], ModelSpec, float], RawDetections
 
 #: Sides of an input are multiples of the coarsest map's stride, px.
 _STRIDE = 32
-
-
-@dataclass(frozen=True)
-class Detections:
-    """Persons in an image, by falling score.
-
-    boxes : (N, 4) float32 px, x_min y_min x_max y_max, clipped to the image
-    scores : (N,) float32 in [0, 1]
-    """
-
-    boxes: np.ndarray
-    scores: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.scores)
 
 
 class Detector:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+#: Overlaps, of the union or of the smaller box: looks mix; one may hide the other, or be its box again; they are one.
+TOUCHES, PARTLY, MOSTLY = 0.1, 0.3, 0.5
 #: Most boxes that :func:`suppress` keeps: more persons than a tracker follows.
 _MAX_BOXES = 100
 

@@ -13,12 +13,13 @@ _GREY = 114
 
 
 @dataclass(frozen=True)
-class Letterbox:
-    """Input px = (image px - origin) * scale + offset."""
+class InputPlace:
+    """Place of a network's input (width, height) px in an image: its px = (image px - origin) * scale + offset."""
 
-    scale: float
     origin: tuple[float, float]
+    scale: float
     offset: tuple[float, float]
+    size: tuple[int, int]
 
     def to_image(self, points: np.ndarray) -> np.ndarray:
         """(..., 2) input px -> image px."""
@@ -27,7 +28,7 @@ class Letterbox:
 
 def letterbox(
     image: np.ndarray, window: tuple[int, int, int, int], size: tuple[int, int], centred: bool = False
-) -> tuple[np.ndarray, Letterbox]:
+) -> tuple[np.ndarray, InputPlace]:
     """Scale a window of the image into a canvas of ``size`` at its aspect ratio; the rest is grey.
 
     image : (H, W, 3) uint8
@@ -42,7 +43,7 @@ def letterbox(
     canvas = np.full((size[1], size[0], 3), _GREY, np.uint8)
     left, top = ((size[0] - width) // 2, (size[1] - height) // 2) if centred else (0, 0)
     canvas[top : top + height, left : left + width] = shrink(view, (width, height))
-    return canvas, Letterbox(scale, (float(x0), float(y0)), (float(left), float(top)))
+    return canvas, InputPlace((float(x0), float(y0)), scale, (float(left), float(top)), size)
 
 
 def shrink(view: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -63,33 +64,23 @@ def shrink(view: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(view, size, interpolation=cv2.INTER_LINEAR)
 
 
-@dataclass(frozen=True)
-class Crop:
-    """Crop px = (image px + 0.5 - centre) * scale + size / 2 - 0.5, pixel centres at whole numbers."""
+def crop_around(box: np.ndarray, size: tuple[int, int], padding: float) -> InputPlace:
+    """Crop of ``size`` (width, height) around a box (4,) x_min y_min x_max y_max, enlarged by ``padding``.
 
-    centre: tuple[float, float]
-    scale: float
-    size: tuple[int, int]
-
-    def to_image(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2) crop px -> image px."""
-        half = np.array(self.size, np.float32) / 2
-        return (points + 0.5 - half) / np.float32(self.scale) + np.array(self.centre, np.float32) - 0.5
-
-
-def crop_around(box: np.ndarray, size: tuple[int, int], padding: float) -> Crop:
-    """Crop of ``size`` (width, height) around a box (4,) x_min y_min x_max y_max, enlarged by ``padding``."""
+    The middle of the crop is that of the box; centres of pixels are at whole numbers.
+    """
     x0, y0, x1, y1 = (float(v) for v in box)
     width, height = max(x1 - x0, 1.0) * padding, max(y1 - y0, 1.0) * padding
     scale = min(size[0] / width, size[1] / height)
-    return Crop(((x0 + x1) / 2, (y0 + y1) / 2), scale, size)
+    middle = (x0 + x1) / 2 - 0.5, (y0 + y1) / 2 - 0.5
+    return InputPlace(middle, scale, (size[0] / 2 - 0.5, size[1] / 2 - 0.5), size)
 
 
-def cut(image: np.ndarray, crop: Crop) -> np.ndarray:
+def cut(image: np.ndarray, crop: InputPlace) -> np.ndarray:
     """(H, W, 3) uint8 -> crop (size[1], size[0], 3), black outside the image."""
     import cv2
 
-    (cx, cy), scale, (width, height) = crop.centre, crop.scale, crop.size
+    (cx, cy), scale, (width, height) = np.add(crop.origin, 0.5), crop.scale, crop.size
     left, top, exact = 0, 0, np.array([1.0, 1.0])
     if scale < 0.5:
         # Bilinear sampling would skip pixels: average first, over the visible part.

@@ -14,9 +14,9 @@ import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 
-#: Side of the detector's input, px, and the strides of its anchors: two anchors a cell for each entry.
+#: Side of the detector's input, px, and the number of its anchors in each cell of a stride.
 _SIDE = 224
-_STRIDES = (8, 16, 32, 32, 32)
+_ANCHORS = {8: 2, 16: 2, 32: 6}
 #: Of a raw row of the detector: the middle of the hips, and a point on the circle about it that holds the body.
 _HIPS, _CIRCLE = slice(4, 6), slice(6, 8)
 #: Width and height of a standing person's box over the circle's radius.
@@ -25,17 +25,17 @@ _SIDES = np.array([1.0, 2.0], np.float32)
 _LEAST = 0.5
 #: Side of the pose network's input, px, and its 39 points, of which these are the joints of ``coco21``.
 _POSE_SIDE, _POINTS = 256, 39
-_COCO_21 = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28, 31, 32, 29, 30)
+_COCO_21 = np.r_[0, 2, 5, 7, 8, 11:17, 23:29, 31, 32, 29, 30]
 
 
 def anchors() -> np.ndarray:
     """Centres (2254, 2) x y of the detector's anchors, px of its input: by stride, row and column."""
     centres = []
-    for stride in sorted(set(_STRIDES)):
+    for stride, count in _ANCHORS.items():
         n = _SIDE // stride
         y, x = np.mgrid[:n, :n]
         cells = (np.stack([x, y], -1).reshape(-1, 2) + 0.5) * stride
-        centres.append(np.repeat(cells, 2 * _STRIDES.count(stride), axis=0))
+        centres.append(np.repeat(cells, count, axis=0))
     return np.concatenate(centres).astype(np.float32)
 
 
@@ -63,10 +63,10 @@ def _joints(rows: np.ndarray, person: np.ndarray, space: np.ndarray) -> list[np.
 
     And the joints in space (1, 21, 3): m about the hips' middle, x right, y down, z away along the ray to it.
     """
-    points = rows.reshape(1, 1, _POINTS, -1)[:, :, list(_COCO_21)]
+    points = rows.reshape(1, 1, _POINTS, -1)[:, :, _COCO_21]
     seen = _sigmoid(points[..., 3:4]) * person
     places = np.concatenate([points[..., [1, 0]] / _POSE_SIDE, seen], axis=3)
-    return [places.astype(np.float32), space.reshape(1, _POINTS, 3)[:, list(_COCO_21)]]
+    return [places.astype(np.float32), space.reshape(1, _POINTS, 3)[:, _COCO_21]]
 
 
 def _sigmoid(values: np.ndarray) -> np.ndarray:

@@ -22,25 +22,23 @@ class Calibration:
         the second peak's height and ten times the spread's standard deviation over the box
     """
 
-    scores: tuple[float, ...]
     sigmas: tuple[float, ...]
     spread_share: float
     intercept: float
     per_score: float
     per_second_peak: float = 0.0
     per_spread: float = 0.0
+    scores: tuple[float, ...] = (0.0, 0.3, 0.5, 0.65, 0.75, 0.85, 0.95)
 
-
-_KNOTS = (0.0, 0.3, 0.5, 0.65, 0.75, 0.85, 0.95)
 
 #: Fitted with PP-TinyPose and MoveNet Lightning.  SimCC and one-stage models use the most similar kind's constants: the
 #: fit had no weights of theirs.
 CALIBRATIONS: dict[str, Calibration] = {
     "heatmap": Calibration(
-        _KNOTS, (0.0444, 0.0316, 0.0282, 0.0282, 0.0282, 0.0134, 0.0099), 0.25, -1.543, 6.847, -4.887, -0.997
+        (0.0444, 0.0316, 0.0282, 0.0282, 0.0282, 0.0134, 0.0099), 0.25, -1.543, 6.847, -4.887, -0.997
     ),
-    "simcc": Calibration(_KNOTS, (0.0444, 0.0316, 0.0282, 0.0282, 0.0282, 0.0134, 0.0099), 0.25, -1.543, 6.847),
-    "movenet": Calibration(_KNOTS, (0.0494, 0.0244, 0.0221, 0.0201, 0.0173, 0.0169, 0.0129), 0.0, -0.969, 7.309),
+    "simcc": Calibration((0.0444, 0.0316, 0.0282, 0.0282, 0.0282, 0.0134, 0.0099), 0.25, -1.543, 6.847),
+    "movenet": Calibration((0.0494, 0.0244, 0.0221, 0.0201, 0.0173, 0.0169, 0.0129), 0.0, -0.969, 7.309),
 }
 _ONE_STAGE = CALIBRATIONS["movenet"]
 
@@ -121,15 +119,16 @@ CLEAR_CONFIDENCE = 0.8  # mean confidence of a clear pose; persons in bad light 
 LEAST_BESIDE = (
     0.6  # least confidence of a joint in another's box, too: of the own ones 5 % have less, of others' the half
 )
-_SEEN = 0.3  # least confidence of a joint that counts: boxes without a person have a mean below 0.33
-_SAME = 0.05  # median distance of one person's joints in two boxes, share of the body's longer extent
-_MARGIN = 0.06  # of a person's box around the joints, share of their longer extent: head and feet
+SEEN = 0.3  # least confidence of a joint that counts: boxes without a person have a mean below 0.33
+SAME_JOINTS = 0.05  # median distance of one person's joints in two boxes, share of the body's longer extent
+BOX_MARGIN = 0.06  # of a person's box around the joints, share of their longer extent: head and feet
 _PATCH_PX = 32  # side of the patch in which a shadow is sought
 _AROUND = 0.3  # margin around the box that shows the ground, share of its sides
 #: Brightness of a shadow over that of the ground, sRGB: sun and sky over sky alone; black clothes are darker.
-_SHADOW = (0.3, 0.85)
-_TINT = 0.14  # largest difference between the channels' ratios in a shadow; skylight makes it bluer
-_DIFFERENT = 0.15  # least difference from the ground of what stands or lies on it, share of the brightness
+_DARKEST = 0.3
+#: Least difference from the ground of what stands or lies on it, also of a shadow, and the largest between the ratios
+#: of its channels, as skylight makes it bluer; shares of the brightness.
+_DIFFERENT = 0.15
 _LEAST_DIFFERENT = 0.08  # least share of the box that differs from the ground
 _PENALTY = 0.3  # what a box full of shadow takes from the confidence of its pose, from half a box on
 
@@ -151,7 +150,7 @@ class BodyPose(NamedTuple):
         """Over ``BODY_15``: the thresholds hold for networks with and without feet."""
         return float(self.confidence[: len(BODY_15)].mean())
 
-    def extent(self, least: float = _SEEN, share: float = 0.7) -> np.ndarray | None:
+    def extent(self, least: float = SEEN, share: float = 0.7) -> np.ndarray | None:
         """(4,) px box of the joints; None when fewer than a share of ``BODY_15`` are seen with the least confidence."""
         seen = self.confidence[: len(BODY_15)] >= least
         if seen.sum() < share * len(seen):
@@ -160,14 +159,16 @@ class BodyPose(NamedTuple):
         box: np.ndarray = np.concatenate([xy.min(axis=0), xy.max(axis=0)])
         return box
 
-    def box(self, least: float = _SEEN, share: float = 0.7) -> np.ndarray | None:
+    def box(self, least: float = SEEN, share: float = 0.7) -> np.ndarray | None:
         """(4,) px box of the person with these joints; None as for :meth:`extent`."""
         joints = self.extent(least, share)
-        return None if joints is None else joints + _MARGIN * (joints[2:] - joints[:2]).max() * np.array([-1, -1, 1, 1])
+        return (
+            None if joints is None else joints + BOX_MARGIN * (joints[2:] - joints[:2]).max() * np.array([-1, -1, 1, 1])
+        )
 
     def limbs(self) -> np.ndarray:
         """(14,) px, lengths in the image of what joins the joints of ``BODY_15``; NaN where one is not seen."""
-        xy = np.where(self.confidence[:, None] >= _SEEN, self.xy, np.nan)[: len(BODY_15)]
+        xy = np.where(self.confidence[:, None] >= SEEN, self.xy, np.nan)[: len(BODY_15)]
         return np.asarray(np.linalg.norm(xy[1:] - xy[list(BODY_15.parents[1:])], axis=1))
 
     def belief(self, image: np.ndarray, box: np.ndarray) -> float:
@@ -177,12 +178,12 @@ class BodyPose(NamedTuple):
 
     def same_person(self, other: BodyPose) -> bool:
         """Whether two boxes of one image gave the joints of one person."""
-        seen = np.minimum(self.confidence, other.confidence)[: len(BODY_15)] >= _SEEN
+        seen = np.minimum(self.confidence, other.confidence)[: len(BODY_15)] >= SEEN
         if seen.sum() < 0.5 * len(seen):
             return False
         xy = other.xy[: len(BODY_15)][seen]
         apart = np.linalg.norm(self.xy[: len(BODY_15)][seen] - xy, axis=1)
-        return bool(np.median(apart) < _SAME * np.ptp(xy, axis=0).max())
+        return bool(np.median(apart) < SAME_JOINTS * np.ptp(xy, axis=0).max())
 
 
 class BodyPoseModel:
@@ -228,7 +229,7 @@ def shadow_share(image: np.ndarray, box: np.ndarray) -> float:
     different = (np.abs(ratio - 1.0) > _DIFFERENT).any(axis=1)
     if different.mean() < _LEAST_DIFFERENT:
         return 0.0
-    shadow = (mean > _SHADOW[0]) & (mean < _SHADOW[1]) & (spread < _TINT)
+    shadow = (mean > _DARKEST) & (mean < 1 - _DIFFERENT) & (spread < _DIFFERENT)
     return float((shadow & different).sum() / different.sum())
 
 

@@ -7,21 +7,19 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.perception.detection.detector import DECODERS
-from drocap_ros.perception.detection.nms import iou
+from drocap_ros.perception.detection.nms import TOUCHES, iou
 from drocap_ros.perception.models.network_input import Normalizer, crop_around, cut
 from drocap_ros.perception.models.runtime import Model
 from drocap_ros.perception.models.spec import ModelSpec
 from drocap_ros.skeleton import JointSet, joint_set
 
-#: Radius in cells of the window for the second moments around a peak: three trained widths.
-_RADIUS = 6
 #: Least height of a second peak, as a share of the highest one; less is noise of the network.
 _LEAST_SECOND = 0.1
 #: Height over the peak's below which a distribution is background.
 _BACKGROUND = 0.05
 #: Standard deviation in cells of the Gaussian in the training targets (MMPose, PaddleDetection).
 _TRAINED_SIGMA = 2.0
-#: Window of SimCC's spread in trained widths of the 1-D Gaussian, sqrt(side / 8) (RTMPose: 5.66 px for 256).
+#: Half the window of second moments in trained widths; SimCC's is sqrt(side / 8) (RTMPose: 5.66 px for 256).
 _WINDOW_SIGMAS = 3.0
 
 
@@ -118,7 +116,8 @@ def _newton_step(maps: np.ndarray, peak: np.ndarray) -> np.ndarray:
 def _moments(maps: np.ndarray, peak: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """(P, 3) cells^2: second moments about the joint within a window, less the trained width, at least 0."""
     joints, rows, columns = maps.shape
-    steps = np.arange(-_RADIUS, _RADIUS + 1)
+    radius = round(_WINDOW_SIGMAS * _TRAINED_SIGMA)
+    steps = np.arange(-radius, radius + 1)
     px, py = peak[:, :1] + steps, peak[:, 1:] + steps  # (P, n)
     inside = ((py >= 0) & (py < rows))[:, :, None] & ((px >= 0) & (px < columns))[:, None, :]
     j = np.arange(joints)[:, None, None]
@@ -167,10 +166,8 @@ def _parabola(response: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
     return position / ratio, np.maximum(moment, 0.0) / ratio**2
 
 
-#: Least score of a person of a one-stage model: the detector has seen the person already;
+#: Least score of a person of a one-stage model: the detector has seen the person already.
 _LEAST_SCORE = 0.05
-#: and least overlap (IoU) with the box of the crop: another person's box hardly has it.
-_LEAST_OVERLAP = 0.1
 
 
 class NetworkKeypoints(NamedTuple):
@@ -208,7 +205,7 @@ class PoseModel:
         crop = crop_around(box, self.spec.input_size, self.spec.box_padding)
         outputs = self.model(self._normalize(cut(image, crop)))
         corners = np.asarray(box, np.float32).reshape(2, 2)
-        in_crop = (corners - np.array(crop.centre, np.float32)) * crop.scale + np.array(crop.size) / 2
+        in_crop = (corners - np.array(crop.origin, np.float32) - 0.5) * crop.scale + np.array(crop.size) / 2
         peaks = self._decode(outputs, in_crop.reshape(4))
         spread = peaks.spread * np.float32(1 / crop.scale) ** 2
         size = float(max(box[2] - box[0], box[3] - box[1]))
@@ -231,7 +228,7 @@ class PoseModel:
         """The person in a one-stage model's output that overlaps ``box`` (4,) input px most; scores 0 without one."""
         raw = DECODERS[self.spec.layout](outputs, self.spec, _LEAST_SCORE)
         overlap = iou(raw.boxes.astype(np.float32), box[None].astype(np.float32))[:, 0]
-        worth = np.where(overlap >= _LEAST_OVERLAP, overlap * raw.scores, 0.0)
+        worth = np.where(overlap >= TOUCHES, overlap * raw.scores, 0.0)
         if raw.keypoints is None or not worth.any():
             return certain_peaks(np.zeros((len(self.joints), 3), np.float32))
         return certain_peaks(raw.keypoints[int(np.argmax(worth))])

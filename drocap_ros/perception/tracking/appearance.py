@@ -46,7 +46,7 @@ def difference(seen: np.ndarray, known: np.ndarray) -> np.ndarray:
 _PARTS = ((0.03, 0.17), (0.2, 0.5), (0.55, 0.9))
 _WIDTH = 0.5  # middle share of the box's width, which holds little background
 _BINS = 8  # of each histogram
-_PATCH_PX = (12, 12)  # size of a part, independent of the person's
+_PATCH_PX = 12  # side of a part, independent of the person's
 
 
 def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
@@ -74,7 +74,7 @@ def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
         view = image[rows, columns]
         if 0 in view.shape:
             return None
-        lab = cv2.cvtColor(cv2.resize(view, _PATCH_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2LAB)
+        lab = cv2.cvtColor(cv2.resize(view, (_PATCH_PX, _PATCH_PX), interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2LAB)
         # Colours of clothes and skin lie within a quarter of the range of a and b.
         ranges = ((0, 255), (96, 160), (96, 160))
         histograms += [_soft_histogram(lab[..., c].ravel(), *between) for c, between in enumerate(ranges)]

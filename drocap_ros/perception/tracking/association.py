@@ -7,15 +7,14 @@ assigned one to one, at the least sum: in a crossing each detection has its owne
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import iou, overlap_coefficient
-from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person
+from drocap_ros.perception.detection.detector import Detections
+from drocap_ros.perception.detection.nms import TOUCHES, iou, overlap_coefficient
+from drocap_ros.perception.tracking.person import PREDICTION_S, QUESTION_S, SURE_CONFIDENCE, Person
 
 ONE_PERSON = 0.75  # overlap coefficient above which two boxes may be one person's
-MIXED_IOU = 0.1  # overlap above which two persons' appearances mix
 FORGET_S = 20.0  # time after which a lost subject is not re-identified
 #: Dissimilarity (1 - Bhattacharyya coefficient) by which the cost of a look grows by one: one person's looks differ by
 #: 0.02 to 0.05 from image to image, two persons' in like clothes by 0.05 to 0.2;
@@ -25,26 +24,19 @@ _OTHER_SIMILARITY = 0.7  # below which a look is someone else's
 _STUDENT = 3.0  # degrees of freedom of an edge's error: cover, shadows and other persons take an edge away at a time
 _AGAIN = 4.0  # cost of a detection that is mostly inside a better-scored one, or holds it: it may be that one again
 _MISSED = 11.0  # cost of a person without detection: two edges off, or the look of someone else
-_IMPOSSIBLE = 1e6
 
 
-class Seen(NamedTuple):
-    """Detections in one image: boxes (N, 4) px, scores (N,), and N descriptors of the appearance."""
+def mixed(seen: Detections) -> np.ndarray:
+    """(N,) bool, detections that overlap another one, so that their appearances are mixed."""
+    overlap = iou(seen.boxes, seen.boxes)
+    np.fill_diagonal(overlap, 0.0)
+    return np.asarray((overlap > TOUCHES).any(axis=1))
 
-    boxes: np.ndarray
-    scores: np.ndarray
-    appearances: list[np.ndarray | None]
 
-    def mixed(self) -> np.ndarray:
-        """(N,) bool, detections that overlap another one, so that their appearances are mixed."""
-        overlap = iou(self.boxes, self.boxes)
-        np.fill_diagonal(overlap, 0.0)
-        return np.asarray((overlap > MIXED_IOU).any(axis=1))
-
-    def again(self) -> np.ndarray:
-        """(N,) bool, detections that share most with one of a higher score."""
-        better = self.scores[None] > self.scores[:, None]
-        return np.asarray((better & (overlap_coefficient(self.boxes, self.boxes) > ONE_PERSON)).any(axis=1))
+def _again(seen: Detections) -> np.ndarray:
+    """(N,) bool, detections that share most with one of a higher score."""
+    better = seen.scores[None] > seen.scores[:, None]
+    return np.asarray((better & (overlap_coefficient(seen.boxes, seen.boxes) > ONE_PERSON)).any(axis=1))
 
 
 def look_cost(person: Person, appearances: Sequence[np.ndarray | None]) -> np.ndarray:
@@ -70,22 +62,22 @@ def place_cost(person: Person, boxes: np.ndarray, expected: bool = False) -> np.
     return np.asarray(0.5 * (_STUDENT + 1) * np.log1p(deviation**2 / _STUDENT) @ weight + np.log(spread))
 
 
-def cost_of(persons: Sequence[Person], seen: Seen) -> np.ndarray:
+def cost_of(persons: Sequence[Person], seen: Detections) -> np.ndarray:
     """(M, N) of the detections as the persons', who are predicted to their image."""
     cost = np.empty((len(persons), len(seen.boxes)))
     for i, person in enumerate(persons):
         cost[i] = place_cost(person, seen.boxes) + look_cost(person, seen.appearances) - np.log(seen.scores)
-    return np.asarray(cost + _AGAIN * seen.again())
+    return np.asarray(cost + _AGAIN * _again(seen))
 
 
-def assign(persons: Sequence[Person], seen: Seen) -> list[tuple[int, int]]:
+def assign(persons: Sequence[Person], seen: Detections) -> list[tuple[int, int]]:
     """Pairs (person, detection) of the least sum of costs; whoever is in none was not detected."""
     if not persons or not len(seen.boxes):
         return []
     from scipy.optimize import linear_sum_assignment
 
     cost = cost_of(persons, seen)
-    nobody = np.full((len(persons), len(persons)), _IMPOSSIBLE)
+    nobody = np.full((len(persons), len(persons)), np.inf)
     # Whoever is seen in most images is seen in this one; a box that came up once or twice rarely is.
     np.fill_diagonal(nobody, [_MISSED + np.log(p.rate / (1.0 - p.rate)) for p in persons])
     rows, columns = linear_sum_assignment(np.concatenate([cost, nobody], axis=1))
@@ -101,8 +93,6 @@ _STRANGER = 6.0  # cost of a new track as nobody's who was seen before,
 _ALONE = 9.0  # and where it is certainly a person and no one else may as well be the lost one: the light may change,
 _ALONE_S = 6.0  # within this time
 MARGIN = 1.5  # by which a cost has to be less than another's to be clearly less
-_KNOWN_S = 1.0  # time for which someone new is looked at before the subject is given up for them
-_GONE_S = 0.4  # of a search over the whole image after which someone whom it does not find is out of view
 
 
 def again_cost(lost: Person, person: Person) -> float:
@@ -142,7 +132,7 @@ def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_
         return None
     # A box that came up once or twice, as a second one around the lost person, is nobody who comes back.
     known = [p for p in persons if p is not lost and p.plausible and p.hits > confirm_frames]
-    gone = [p for p in known if p.undetected_s(stamp_ns) > _GONE_S]
+    gone = [p for p in known if p.undetected_s(stamp_ns) > PREDICTION_S]
     if any(look_cost(p, [person.appearance])[0] + MARGIN < look_cost(lost, [person.appearance])[0] for p in gone):
         return None
     # A second box around the same person is no other one.
@@ -159,11 +149,11 @@ def followed_on(lost: Person | None, persons: list[Person], coast_s: float, stam
     place: that is a new track.
     """
     others = [p for p in persons if p is not lost]
-    if lost is None or lost.unconfirmed_s(stamp_ns) <= coast_s + _GONE_S:
+    if lost is None or lost.unconfirmed_s(stamp_ns) <= coast_s + PREDICTION_S:
         return others
-    return [p for p in others if p.undetected_s(stamp_ns) <= _GONE_S]
+    return [p for p in others if p.undetected_s(stamp_ns) <= PREDICTION_S]
 
 
 def certainly_others(lost: Person, persons: list[Person], stamp_ns: int) -> list[Person]:
     """Persons without those who have just come into view: half hidden as yet, they may be the lost subject."""
-    return [p for p in persons if (stamp_ns - p.first_ns) * 1e-9 >= _KNOWN_S or not could_be(lost, p)]
+    return [p for p in persons if (stamp_ns - p.first_ns) * 1e-9 >= QUESTION_S or not could_be(lost, p)]

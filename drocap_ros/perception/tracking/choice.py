@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from drocap_ros.perception.detection.nms import PARTLY
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import certainly_others
-from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person, person_at
+from drocap_ros.perception.tracking.person import DOUBT_S, SURE_CONFIDENCE, Person, person_at
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
 
-_CERTAIN_SCORE = 0.6  # from which the first person ever needs no confirmation by further images
-_GIVEN_IOU = 0.2  # least overlap of a detection with a given box
+CERTAIN_SCORE = 0.6  # from which the first person ever, and one with a clear pose, needs no further images
 _BELIEF = 4.0  # logarithm of the size that full belief in the pose outweighs: a shadow is no smaller than the person
-_GIVE_UP_S = 3.0  # for ``on_loss = next``: time beyond coasting after which a subject lost in the image is given up
 
 
 class SubjectChoice:
@@ -32,7 +31,7 @@ class SubjectChoice:
         if self.box is None:
             return None
         box, self.box = self.box, None
-        return person_at(box, persons, stamp_ns, _GIVEN_IOU) or Person(box, 0.0, stamp_ns, describe(image, box))
+        return person_at(box, persons, stamp_ns, PARTLY) or Person(box, 0.0, stamp_ns, describe(image, box))
 
     def by_rule(
         self,
@@ -74,14 +73,14 @@ class SubjectChoice:
             return self._config.subject in ("box", "roi") and (first or waits)
         # Whoever was followed for a moment is not waited for much longer.
         followed_s = (last.confirmed_ns - last.first_ns) * 1e-9
-        longest_s = 0.0 if last.left_image else coast_s + min(_GIVE_UP_S, followed_s)
+        longest_s = 0.0 if last.left_image else coast_s + min(DOUBT_S, followed_s)
         return waits or last.unconfirmed_s(stamp_ns) <= longest_s
 
     def _confirmed(self, person: Person, first: bool) -> bool:
         """Whether enough images show the person; at the beginning a certain detection is enough."""
-        possible = person.plausible or (first and person.mean_score >= _CERTAIN_SCORE)
+        possible = person.plausible or (first and person.mean_score >= CERTAIN_SCORE)
         unjudged = self.by_poses and np.isnan(person.pose.value)
         if not possible or unjudged or person.mean_score < self._config.detection_threshold:
             return False
-        certain = person.score >= _CERTAIN_SCORE and not person.pose.value < SURE_CONFIDENCE
+        certain = person.score >= CERTAIN_SCORE and not person.pose.value < SURE_CONFIDENCE
         return person.hits >= self._config.confirm_frames or (self.nothing_yet and certain)

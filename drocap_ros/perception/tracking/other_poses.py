@@ -7,12 +7,11 @@ import numpy as np
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.tracking.camera_motion import sweeps
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, SURE_CONFIDENCE, Person, Subject
+from drocap_ros.perception.tracking.search import FULL_EVERY_NS, SEARCH_EVERY_NS
 from drocap_ros.perception.tracking.subject import SubjectTracker
 
 _MOST = 2  # poses of others per image while there is no subject, or of other boxes around it
 _BETTER = 0.1  # confidence by which the pose in another box around the subject has to exceed the one in its own
-_JUDGE_EVERY_NS = 1_000_000_000  # interval of the poses of a bystander beside the subject,
-_SEARCH_EVERY_NS = 300_000_000  # and without one
 
 
 class OtherPoses:
@@ -79,4 +78,4 @@ def _due(person: Person, searching: bool, choosing: bool, stamp_ns: int) -> bool
     # A person who comes out of cover shows more joints in every image.
     if searching and CONFIRM_CONFIDENCE <= person.pose.last < SURE_CONFIDENCE:
         return True
-    return stamp_ns - judged_ns >= (_SEARCH_EVERY_NS if searching else _JUDGE_EVERY_NS)
+    return stamp_ns - judged_ns >= (SEARCH_EVERY_NS if searching else FULL_EVERY_NS)

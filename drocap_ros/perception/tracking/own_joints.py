@@ -1,7 +1,7 @@
 """Bodies from image to image, and whose joints are these where persons overlap: each is one body's or nobody's.
 
-Networks that see one box give the joints of whoever is in front.  A joint is where its body's motion lets it be, a limb
-is no longer than that of the body, and two bodies have no joint in common: what that leaves open is dropped.
+Networks that see one box give the joints of whoever is in front.  A joint is where its body's motion lets it be, and
+two bodies have no joint in common: what that leaves open is dropped.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from drocap_ros.perception.detection.nms import iou
-from drocap_ros.perception.pose.body_pose import BodyPose
+from drocap_ros.keypoints import PoseObservation
+from drocap_ros.perception.pose.body_pose import BOX_MARGIN, SAME_JOINTS, SEEN, BodyPose
 from drocap_ros.perception.tracking.appearance import difference
-from drocap_ros.perception.tracking.person import Person
 from drocap_ros.skeleton import BODY_15, JointSet
 
 _ERROR = 0.05  # of an expected joint at once, lengths: networks err by 0.02, and persons are not steady
@@ -23,25 +22,27 @@ _ERROR_PER_S = {"wrist": 1.2, "elbow": 0.8, "ankle": 1.0, "knee": 0.7}  # and mo
 _TRUNK_PER_S = 0.5  # of others; a walk swings a wrist by 2 lengths/s, and the last speed predicts half of it
 _LONGEST_S = 1.0  # over which it grows
 _RATE = 0.6  # weight of a new speed
-_DECAY_S = 0.3  # time in which a speed without measurement falls to a third
-_MARGIN = 0.06  # of the box around the joints, as of a pose's own box
-_SAME_BOX = 0.4  # overlap from which a detection is this person's
-_LENGTH_RATE = 0.1  # weight of a new length
-_COLOUR_RATE = 0.1  # and of a new colour
+_DECAY_S = 0.3  # time in which a speed without measurement falls to a third: beside another body the joint stays unseen
+SLOW_RATE = 0.1  # weight of a new value in what hardly changes: of some ten images
 
 
-class BodyTrack:
-    """One person: identity and look in ``person``, joints (P, 2) px as expected in the image of ``stamp_ns``.
+LEAST_JOINTS = 4  # of BODY_15 that show a person
+
+
+class ExpectedJoints:
+    """Joints (P, 2) px of a person as expected in the image of ``stamp_ns``, from those of a pose on.
 
     colours : (P, 3) L a b of the limbs that end at the joints, NaN = unknown
     length : px, usual longer side of the box around the joints
     joints_ns : (P,) when each joint was last this person's; seen_ns : when enough of them were
     detected_ns : last detection of the whole image on this person
+    seen : the observation of the newest image in which joints were this person's
     """
 
-    def __init__(self, person: Person, pose: BodyPose, joints: JointSet, stamp_ns: int) -> None:
-        self.person, self.joint_set = person, joints
+    def __init__(self, pose: BodyPose, joints: JointSet, stamp_ns: int) -> None:
+        self.joint_set = joints
         self.stamp_ns = self.seen_ns = self.detected_ns = stamp_ns
+        self.seen: PoseObservation | None = None
         self.xy: np.ndarray = pose.xy.astype(float)
         self.speed = np.zeros_like(self.xy)  # px/s
         self.joints_ns = np.full(len(joints), stamp_ns)
@@ -50,6 +51,10 @@ class BodyTrack:
         self.length = max(float((box[2:] - box[:2]).max()), 1.0)
         names = [name.lstrip("lr") for name in joints.joints]
         self._per_s = np.array([_ERROR_PER_S.get(name, _TRUNK_PER_S) for name in names])
+
+    def seen_in(self, stamp_ns: int) -> PoseObservation | None:
+        """The observation of the image of this stamp; None where it shows no joints of this person."""
+        return self.seen if self.seen is not None and self.seen.stamp_ns == stamp_ns else None
 
     def predict(self, stamp_ns: int) -> None:
         """Expect the joints at a later time; a long gap between images is a time without measurement, too."""
@@ -63,7 +68,6 @@ class BodyTrack:
     def move_camera(self, matrix: np.ndarray) -> None:
         """Follow the image's motion (2, 3) by the camera's."""
         self.xy = self.xy @ matrix[:, :2].T + matrix[:, 2]
-        self.person.move_camera(matrix)
 
     @property
     def reach(self) -> np.ndarray:
@@ -75,16 +79,8 @@ class BodyTrack:
     def box(self) -> np.ndarray:
         """(4,) px around the expected joints, as a detector gives one."""
         low, high = self.xy.min(axis=0), self.xy.max(axis=0)
-        margin = _MARGIN * float((high - low).max())
+        margin = BOX_MARGIN * float((high - low).max())
         return np.concatenate([low - margin, high + margin])
-
-    def overlap(self, box: np.ndarray) -> float:
-        """Intersection over union with a box (4,) px."""
-        return float(iou(box[None].astype(float), self.box[None])[0, 0])
-
-    def on(self, box: np.ndarray) -> bool:
-        """Whether a box (4,) px may be this person's."""
-        return self.overlap(box) > _SAME_BOX
 
     def accept(self, xy: np.ndarray, own: np.ndarray, believed: bool) -> None:
         """Take over those measured joints (P, 2) px of the image that are this person's, (P,) bool."""
@@ -102,75 +98,24 @@ class BodyTrack:
             self.seen_ns = self.stamp_ns
             extent = self.box
             length = float((extent[2:] - extent[:2]).max())
-            self.length += _LENGTH_RATE * (length - self.length)
+            self.length += SLOW_RATE * (length - self.length)
 
     def look(self, colours: np.ndarray, free: np.ndarray) -> None:
         """Add colours (P, 3) of the limbs: unknown ones, and those at joints (P,) bool where nobody else is."""
         first = np.isnan(self.colours) & np.isfinite(colours)
         self.colours[first] = colours[first]
-        self.colours += _COLOUR_RATE * np.nan_to_num(colours - self.colours) * free[:, None]
+        self.colours += SLOW_RATE * np.nan_to_num(colours - self.colours) * free[:, None]
 
-    def continue_as(self, found: BodyTrack) -> None:
-        """Go on with the joints of a new track in which this lost person was found again."""
-        found.person.continue_as(self.person)
-        self.person, self.xy, self.speed, self.joints_ns = found.person, found.xy, found.speed, found.joints_ns
-        self.stamp_ns, self.seen_ns, self.detected_ns = found.stamp_ns, found.seen_ns, found.detected_ns
-        self.length = found.length
-        self.colours = np.where(np.isnan(self.colours), found.colours, self.colours)
+    def keep_look(self, before: ExpectedJoints) -> None:
+        """Take over the known colours of the joints of an earlier track."""
+        self.colours = np.where(np.isnan(before.colours), self.colours, before.colours)
 
 
-_ONE_PLACE = 0.08  # distance of joints that may be one, lengths of the body
-_NEAR_S = 0.7  # time to an image in which the joint is nobody else's, on either side
-_OFF_WAY = 0.08  # distance from the way between these images at which it is still the own, lengths,
-_OFF_PER_S = 0.15  # and more per second to the nearer one
-
-
-def contested(people: Sequence[np.ndarray], stamp_ns: np.ndarray, length: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Joints (F, P) bool of each person that are more likely another's.
-
-    people : (F, P, 2) px of each, ``BODY_15`` first; stamp_ns : (F,); length : (F,) px of each one's body
-    """
-    times, count = stamp_ns * 1e-9, len(BODY_15)
-    found = []
-    for k, xy in enumerate(people):
-        near = np.zeros(xy.shape[:2], bool)
-        for other in (o for i, o in enumerate(people) if i != k):
-            for theirs in (other[:, :count], other[:, BODY_15.mirror]):
-                apart = np.linalg.norm(xy[:, :count] - theirs, axis=2)
-                near[:, :count] |= apart < _ONE_PLACE * length[k][:, None]
-        doubtful = np.zeros_like(near)
-        for j in np.flatnonzero(near.any(axis=0)):
-            seen = np.isfinite(xy[:, j]).all(axis=1)
-            sure = np.flatnonzero(seen & ~near[:, j])
-            for f in np.flatnonzero(near[:, j]):
-                doubtful[f, j] = _is_off(xy[:, j], sure, times, int(f), float(length[k][f]))
-        found.append(doubtful)
-    return found
-
-
-def _is_off(xy: np.ndarray, sure: np.ndarray, times: np.ndarray, f: int, length: float) -> bool:
-    """Whether a place (F, 2) px in image ``f`` is off the way between the nearest of the sure images."""
-    at = int(np.searchsorted(sure, f))
-    if at == 0 or at == len(sure):
-        return True
-    before, after = int(sure[at - 1]), int(sure[at])
-    since, until = times[f] - times[before], times[after] - times[f]
-    if max(since, until) > _NEAR_S:
-        return True
-    way = xy[before] + since / (since + until) * (xy[after] - xy[before])
-    return bool(np.linalg.norm(xy[f] - way) > length * (_OFF_WAY + _OFF_PER_S * min(since, until)))
-
-
-_SEEN = 0.3  # least confidence of a joint that counts
-_SAME = 0.05  # distance of one joint in two poses, lengths
 _FAR = 3.0  # standard deviations from which a joint's place says no more
-_DROP = 4.5  # cost of a joint that is given to nobody: at three deviations,
+_DROP = 0.5 * _FAR**2  # cost of a joint that is given to nobody,
 _DROP_BODY = 3.0  # and mean cost of a pose that is nobody's
-_OTHER_LOOK = 1.5  # deviations of a limb's colour from which it may be another body's
-_STALE_S = 0.3  # time after which an unseen joint may be anywhere: beside another body it stays unseen
+_OFF = 1.5  # deviations of a joint's place or of its limb's colour from which it may be another body's
 _CLEARLY = 2.0  # times as far from the own body as from the other, from which a joint is the other's
-#: Longest limbs over the length of a standing body, a third more than of most: (joint, its parent) by names.
-_LONGEST = {"knee": 0.36, "ankle": 0.36, "elbow": 0.27, "wrist": 0.24, "shoulder": 0.2, "hip": 0.16, "head": 0.26}
 
 
 class Poses(NamedTuple):
@@ -181,15 +126,8 @@ class Poses(NamedTuple):
     colours: np.ndarray
 
 
-class Owned(NamedTuple):
-    """Which pose each of N bodies has, -1 = none; and of which pose each joint (N, P) is, -1 = of none."""
-
-    pose: np.ndarray
-    joint: np.ndarray
-
-
-def own_joints(tracks: Sequence[BodyTrack], poses: Poses) -> Owned:
-    """The joints of overlapping bodies, of the poses in the boxes where each was expected."""
+def own_joints(tracks: Sequence[ExpectedJoints], poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the poses in the boxes of overlapping bodies each (N,) has; of which each joint (N, P) is; -1 = none."""
     body = _bodies(tracks, poses)
     count = len(BODY_15)
     joint = np.repeat(body[:, None], poses.xy.shape[1], axis=1)
@@ -201,8 +139,7 @@ def own_joints(tracks: Sequence[BodyTrack], poses: Poses) -> Owned:
         colours = poses.colours[np.maximum(joint[k], 0), np.arange(len(joint[k]))]
         mixed = _mixed(track, others, xy[:count]) | _of_others_colour(track, others, xy[:count], colours[:count])
         joint[k, :count] = np.where(mixed, -1, joint[k, :count])
-        joint[k] = np.where(_too_long(track, _of(poses, joint[k])), -1, joint[k])
-    return Owned(body, joint)
+    return body, joint
 
 
 def _of(poses: Poses, joint: np.ndarray) -> np.ndarray:
@@ -212,31 +149,30 @@ def _of(poses: Poses, joint: np.ndarray) -> np.ndarray:
     return xy
 
 
-def _look(track: BodyTrack, colours: np.ndarray) -> np.ndarray:
+def _look(track: ExpectedJoints, colours: np.ndarray) -> np.ndarray:
     """(P,) how unlikely colours (P, 3) are on the body's limbs."""
     off = np.nan_to_num(difference(colours, track.colours), nan=1.0)
     return np.asarray(0.5 * np.minimum(off, _FAR) ** 2)
 
 
-def _cost(track: BodyTrack, xy: np.ndarray) -> np.ndarray:
+def _cost(track: ExpectedJoints, xy: np.ndarray) -> np.ndarray:
     """(..., P) how unlikely places (..., P, 2) px are of the body's joints: of a Gauss about the expected ones."""
     reach = track.reach
     off = np.linalg.norm(xy - track.xy, axis=-1) / reach
     return np.asarray(0.5 * np.minimum(off, _FAR) ** 2 + 2.0 * np.log(reach / reach.min()) * 0.25)
 
 
-def _bodies(tracks: Sequence[BodyTrack], poses: Poses) -> np.ndarray:
+def _bodies(tracks: Sequence[ExpectedJoints], poses: Poses) -> np.ndarray:
     """(N,) index of the pose of each body, -1 = none: two boxes may have given the same body."""
     count = len(BODY_15)
     cost = np.full((len(tracks), 2 * len(tracks)), _DROP_BODY)
     for i in range(len(tracks)):
-        seen = poses.confidence[i, :count] >= _SEEN
-        if seen.sum() < 4 or _given_before(tracks, poses, i):
+        seen = poses.confidence[i, :count] >= SEEN
+        if seen.sum() < LEAST_JOINTS or _given_before(tracks, poses, i):
             cost[:, i] = 2 * _DROP_BODY
             continue
         for k, track in enumerate(tracks):
-            exchanged = _cost(track, poses.xy[i][_exchanged(track)])
-            each = np.minimum(_cost(track, poses.xy[i]), exchanged)
+            each = np.minimum(_cost(track, poses.xy[i]), _cost(track, poses.xy[i][track.joint_set.mirror]))
             cost[k, i] = float((each + _look(track, poses.colours[i]))[:count][seen].mean()) + _age_cost(track)
     rows, columns = linear_sum_assignment(cost)
     found = np.full(len(tracks), -1)
@@ -244,48 +180,47 @@ def _bodies(tracks: Sequence[BodyTrack], poses: Poses) -> np.ndarray:
     return found
 
 
-def _exchanged(track: BodyTrack) -> np.ndarray:
-    return track.joint_set.mirror
-
-
-def _age_cost(track: BodyTrack) -> float:
+def _age_cost(track: ExpectedJoints) -> float:
     """A body unseen for long has no claim on what another one explains as well."""
     return min((track.stamp_ns - track.seen_ns) * 1e-9, 1.0)
 
 
-def _given_before(tracks: Sequence[BodyTrack], poses: Poses, i: int) -> bool:
+def _given_before(tracks: Sequence[ExpectedJoints], poses: Poses, i: int) -> bool:
     """Whether another box gave the same body with more confidence."""
     count = len(BODY_15)
     for other in range(len(tracks)):
         if other == i:
             continue
-        seen = np.minimum(poses.confidence[i], poses.confidence[other])[:count] >= _SEEN
-        if seen.sum() < 4:
+        seen = np.minimum(poses.confidence[i], poses.confidence[other])[:count] >= SEEN
+        if seen.sum() < LEAST_JOINTS:
             continue
         apart = np.linalg.norm(poses.xy[i] - poses.xy[other], axis=1)[:count][seen]
         better = float(poses.confidence[other, :count].mean()), -other
-        if np.median(apart) < _SAME * tracks[i].length and better > (float(poses.confidence[i, :count].mean()), -i):
+        if np.median(apart) < SAME_JOINTS * tracks[i].length and better > (
+            float(poses.confidence[i, :count].mean()),
+            -i,
+        ):
             return True
     return False
 
 
-def _joint(tracks: Sequence[BodyTrack], poses: Poses, body: np.ndarray, j: int) -> np.ndarray:
+def _joint(tracks: Sequence[ExpectedJoints], poses: Poses, body: np.ndarray, j: int) -> np.ndarray:
     """(N,) index of the pose whose joint ``j`` is each body's, its own or -1 = none."""
     result = body.copy()
     for k, i in enumerate(body):
         if i >= 0:
             cost = _cost(tracks[k], poses.xy[i])[j] + 0.5 * _look(tracks[k], poses.colours[i])[j]
-            result[k] = i if poses.confidence[i, j] >= _SEEN and cost < _DROP else -1
+            result[k] = i if poses.confidence[i, j] >= SEEN and cost < _DROP else -1
     return _once(tracks, poses, result, j)
 
 
-def _once(tracks: Sequence[BodyTrack], poses: Poses, result: np.ndarray, j: int) -> np.ndarray:
+def _once(tracks: Sequence[ExpectedJoints], poses: Poses, result: np.ndarray, j: int) -> np.ndarray:
     """The same where two bodies claim one place: it is the nearer one's, and nobody's where neither is so clearly."""
     for a in range(len(tracks)):
         for b in range(a + 1, len(tracks)):
             if result[a] < 0 or result[b] < 0:
                 continue
-            near = _SAME * max(tracks[a].length, tracks[b].length)
+            near = SAME_JOINTS * max(tracks[a].length, tracks[b].length)
             places = poses.xy[result[a], j], poses.xy[result[b], j]
             if np.linalg.norm(places[0] - places[1]) > near or np.linalg.norm(tracks[a].xy[j] - tracks[b].xy[j]) < near:
                 continue
@@ -297,22 +232,24 @@ def _once(tracks: Sequence[BodyTrack], poses: Poses, result: np.ndarray, j: int)
     return result
 
 
-def _mixed(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndarray) -> np.ndarray:
+def _mixed(track: ExpectedJoints, others: Sequence[ExpectedJoints], xy: np.ndarray) -> np.ndarray:
     """(15,) bool: joints (15, 2) px off their expected places, or unseen for long, where another body's may be."""
     count = len(xy)
     own = np.linalg.norm(xy - track.xy[:count], axis=1) / track.reach[:count]
-    stale = (track.stamp_ns - track.joints_ns[:count]) * 1e-9 > _STALE_S
+    stale = (track.stamp_ns - track.joints_ns[:count]) * 1e-9 > _DECAY_S
     mixed = np.zeros(count, bool)
     for other in others:
         reach = other.reach[:count]
         same = np.linalg.norm(xy - other.xy[:count], axis=1) / reach
         mirror = np.linalg.norm(xy - other.xy[BODY_15.mirror], axis=1) / reach[BODY_15.mirror]
         theirs = np.minimum(same, mirror)
-        mixed |= ((own > 1.5) & (theirs * _CLEARLY < own) | stale) & (theirs < _FAR)
+        mixed |= ((own > _OFF) & (theirs * _CLEARLY < own) | stale) & (theirs < _FAR)
     return mixed
 
 
-def _of_others_colour(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndarray, colours: np.ndarray) -> np.ndarray:
+def _of_others_colour(
+    track: ExpectedJoints, others: Sequence[ExpectedJoints], xy: np.ndarray, colours: np.ndarray
+) -> np.ndarray:
     """(15,) bool: joints (15, 2) px at the end of limbs whose colours (15, 3) are another body's, where it may be."""
     count = len(xy)
     own = np.nan_to_num(difference(colours, track.colours[:count]))
@@ -321,14 +258,5 @@ def _of_others_colour(track: BodyTrack, others: Sequence[BodyTrack], xy: np.ndar
         for side in (np.arange(count), BODY_15.mirror):
             theirs = np.nan_to_num(difference(colours, other.colours[side]), nan=np.inf)
             near = np.linalg.norm(xy - other.xy[side], axis=1) < _FAR * other.reach[side]
-            found |= near & (own > _OTHER_LOOK) & (theirs * _CLEARLY < own)
+            found |= near & (own > _OFF) & (theirs * _CLEARLY < own)
     return found
-
-
-def _too_long(track: BodyTrack, xy: np.ndarray) -> np.ndarray:
-    """(P,) bool: joints (P, 2) px at the end of a limb longer than a body's."""
-    joints = track.joint_set
-    parents = np.array(joints.parents)
-    length = np.linalg.norm(xy - xy[np.maximum(parents, 0)], axis=1) / track.length
-    longest = np.array([_LONGEST.get(name.lstrip("lr"), np.inf) for name in joints.joints])
-    return np.asarray((parents >= 0) & (length > longest))

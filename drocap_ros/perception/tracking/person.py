@@ -10,6 +10,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.tracking.camera_motion import moved_box
+from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, SLOW_RATE, ExpectedJoints
 
 #: Standard deviation of a measured box: centre in lengths, logarithm of the sizes.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
@@ -20,7 +21,7 @@ _ACCELERATION = np.array([8.0, 8.0, 2.0, 2.0])
 _FIRST_RATE = np.array([2.0, 2.0, 0.5, 0.5])
 _CAMERA = 0.5  # deviation of the camera's motion at the person, share: water and crowds that move are followed, too
 _DECAY_S = np.array([1.0, 1.0, 0.3, 0.3])  # time in which a rate without measurements falls to a third
-_LONGEST_PREDICTION_S = 0.4  # persons turn, stoop or stop within it
+PREDICTION_S = 0.4  # longest: persons turn, stoop or stop within it
 
 
 class BoxFilter:
@@ -47,7 +48,7 @@ class BoxFilter:
 
     def box_at(self, stamp_ns: int) -> np.ndarray:
         """(4,) px predicted for a time; the state stays."""
-        dt = float(np.clip((stamp_ns - self.stamp_ns) * 1e-9, 0.0, _LONGEST_PREDICTION_S))
+        dt = float(np.clip((stamp_ns - self.stamp_ns) * 1e-9, 0.0, PREDICTION_S))
         x = self.x[:, 0] + dt * self.x[:, 1]
         return _to_box(np.concatenate([x[:2], np.clip(x[2:], 0.0, 10.0)]))
 
@@ -58,7 +59,7 @@ class BoxFilter:
 
     def predict(self, stamp_ns: int) -> None:
         """Advance to a later time; velocities decay without measurements."""
-        dt = min((stamp_ns - self.stamp_ns) * 1e-9, _LONGEST_PREDICTION_S)
+        dt = min((stamp_ns - self.stamp_ns) * 1e-9, PREDICTION_S)
         self.stamp_ns = stamp_ns
         if dt <= 0:
             return
@@ -134,20 +135,18 @@ CONFIRM_CONFIDENCE = 0.5
 SURE_CONFIDENCE = 0.7
 _IMPLAUSIBLE = 0.45  # recent mean confidence of a track without a person
 _USUAL_SHARE = 0.7  # least share of the usual confidence that is believed: persons of 0.9 do not stay at 0.6
-_SLOW_RATE = 0.1  # weight of a new value in the usual confidence and length, of some ten poses,
-_RECENT_RATE = 0.3  # and in recent means, of some three
-_QUESTION_S = 1.0  # time of poses without belief after which a track is questioned,
-_DROP_S = 2.5  # and after which one without a person is dropped
-_APPEARANCE_RATE = 0.08  # weight of a new descriptor in the mean appearance
-_SETTLED = 10  # descriptors in a settled mean appearance
+_RECENT_RATE = 0.3  # weight of a new value in recent means, of some three images
+QUESTION_S = 1.0  # time of poses without belief after which a track is questioned, and of a newcomer who counts,
+_DROP_S = 2.5  # after which one without a person is dropped,
+DOUBT_S = 3.0  # and over which a last detection, or a meeting of two in which they may be exchanged, counts
 #: Deviation of a person's limbs in the image from their recent lengths, shares of the body's: poses of one person have
 #: 0.02 to 0.05, who runs 0.1, two persons' or shadows' 0.1 to 0.4;
-_LIMBS, _LEAST_LIMBS = 0.08, 5
+_LIMBS = 0.08
 _LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn and stoop
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
 _LONG_AGO_NS = 10**18
-#: First, least and largest recent share of detections of a person, and the weight of a new image in it.
-_FIRST_RATE_SEEN, _RATES, _SEEN_RATE = 0.5, (0.2, 0.9), 0.2
+#: First, least and largest recent share of detections of a person.
+_FIRST_RATE_SEEN, _RATES = 0.5, (0.2, 0.9)
 
 
 class PoseBelief:
@@ -192,7 +191,7 @@ class PoseBelief:
         self.last, self.judged_ns = confidence, stamp_ns
         if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self.usual):
             self.choose(box, stamp_ns)
-            self.usual = confidence if not self.usual else self.usual + _SLOW_RATE * (confidence - self.usual)
+            self.usual = confidence if not self.usual else self.usual + SLOW_RATE * (confidence - self.usual)
             if limbs is not None:
                 self._poses += 1
                 known = limbs if self._limbs is None else np.where(np.isnan(self._limbs), limbs, self._limbs)
@@ -208,7 +207,7 @@ class PoseBelief:
         if self._limbs is None or self.believed_ns is None:
             return 1.0
         off = (limbs / self.length - self._limbs) ** 2
-        if np.isfinite(off).sum() < _LEAST_LIMBS:
+        if np.isfinite(off).sum() < LEAST_JOINTS:
             return 1.0
         # Few poses tell little about the usual lengths.
         variance = _LIMBS**2 * (1 + 1 / self._poses) + _LIMBS_PER_S**2 * (stamp_ns - self.believed_ns) * 1e-9
@@ -220,7 +219,7 @@ class PoseBelief:
         if self.plausible_ns is None:
             self.plausible_ns, self.began = stamp_ns, self.box
         length = float((self.box[2:] - self.box[:2]).max())
-        self.length = length if not self.length else self.length + _SLOW_RATE * (length - self.length)
+        self.length = length if not self.length else self.length + SLOW_RATE * (length - self.length)
 
     def growth(self, box: np.ndarray, length: float) -> float:
         """Absolute logarithm of the size of a box (4,) px over the last or the usual one, whichever is nearer.
@@ -244,7 +243,7 @@ class PoseBelief:
     @property
     def questioned(self) -> bool:
         """Whether the poses have not been believable for a second."""
-        return self._fails(_QUESTION_S)
+        return self._fails(QUESTION_S)
 
     @property
     def refuted(self) -> bool:
@@ -285,6 +284,7 @@ class Person:
     met_ns : last time at which its box overlapped the subject's, the subject's that of anybody
     recent : appearance in the last few images
     pose : what its poses say about it
+    joints : where its joints are expected, where everybody's are followed
     """
 
     def __init__(self, box: np.ndarray, score: float, stamp_ns: int, appearance: np.ndarray | None) -> None:
@@ -297,6 +297,7 @@ class Person:
         self.others: set[Person] = set()
         self.met_ns = stamp_ns - _LONG_AGO_NS
         self.pose = PoseBelief(box, stamp_ns)
+        self.joints: ExpectedJoints | None = None
         self.appearance = self.recent = appearance
         self._descriptors = 1 if appearance is not None else 0
 
@@ -342,7 +343,7 @@ class Person:
 
     def searched(self, found: bool) -> None:
         """Count an image in which it was sought at its place."""
-        self.rate = float(np.clip(self.rate + _SEEN_RATE * (found - self.rate), *_RATES))
+        self.rate = float(np.clip(self.rate + _RECENT_RATE * (found - self.rate), *_RATES))
 
     def update(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
         """Update with a detection, not yet confirmed."""
@@ -352,6 +353,15 @@ class Person:
         self.score = score
         self.mean_score += _RECENT_RATE * (score - self.mean_score)
         self.hits += 1
+
+    def measure(self, box: np.ndarray, stamp_ns: int) -> None:
+        """Confirm the person in the box (4,) px around its joints, in place of a detection of this image."""
+        if self.detected_ns == stamp_ns:
+            self.correct(box, self.score)
+        else:
+            self.filter.predict(stamp_ns)
+            self.update(box, self.score, stamp_ns)
+        self.confirm(stamp_ns)
 
     def remainder(self, stamp_ns: int) -> Person:
         """A track of what its box shows, which was found to be no person."""
@@ -365,12 +375,16 @@ class Person:
         self.box, self.pose.began = moved_box(matrix, self.box), moved_box(matrix, self.pose.began)
         if self.pose.box is not None:
             self.pose.box = moved_box(matrix, self.pose.box)
+        if self.joints is not None:
+            self.joints.move_camera(matrix)
 
     def continue_as(self, lost: Person) -> None:
         """Take over what is known of a lost person who was found again in this track."""
         if lost.appearance is not None:
             self.appearance, self._descriptors = lost.appearance, lost._descriptors
         self.others |= lost.others
+        if self.joints is not None and lost.joints is not None:
+            self.joints.keep_look(lost.joints)
 
     def confirm(self, stamp_ns: int) -> None:
         """Confirm the detection at this time."""
@@ -383,13 +397,12 @@ class Person:
         self.recent = _blend(self.recent, appearance, _RECENT_RATE)
         if lasting or not self.appearance_settled:
             self._descriptors += 1
-            rate = max(_APPEARANCE_RATE, 1 / self._descriptors) if self._descriptors < _SETTLED else _APPEARANCE_RATE
-            self.appearance = _blend(self.appearance, appearance, rate)
+            self.appearance = _blend(self.appearance, appearance, max(SLOW_RATE, 1 / self._descriptors))
 
     @property
     def appearance_settled(self) -> bool:
         """Whether the appearance is a mean over enough images."""
-        return self._descriptors >= _SETTLED
+        return self._descriptors * SLOW_RATE >= 1.0
 
     def similarity(self, appearance: np.ndarray | None) -> float:
         """Bhattacharyya coefficient with a descriptor in [0, 1]; 0.5 when one is unknown."""

@@ -8,11 +8,11 @@ from functools import reduce
 import numpy as np
 
 from drocap_ros.perception.detection.detector import Detections, Detector
-from drocap_ros.perception.detection.nms import iou, overlap_coefficient, suppress
+from drocap_ros.perception.detection.nms import MOSTLY, PARTLY, iou, overlap_coefficient, suppress
 from drocap_ros.perception.tracking.association import FORGET_S, could_be
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.perception.tracking.subject import SubjectTracker
+from drocap_ros.perception.tracking.subject import EDGE, SubjectTracker
 
 Window = tuple[int, int, int, int]
 
@@ -25,15 +25,12 @@ CLOSE = (1.45, 208)
 #: and this one is for a low score.
 TIGHT = (1.3, 160)
 _TILE_PX = 800  # images longer than 1.25 of this are also searched in tiles of this side, one per image
-_FULL_EVERY_NS = 1_000_000_000  # interval of detection over the whole image while the subject is in view
-_CLEAR_IOU = 0.5  # least overlap of a detection with the predicted box that needs no second pass
-_AT_PLACE = 0.3  # overlap with the predicted box from which a detection may be the subject
+FULL_EVERY_NS = 1_000_000_000  # interval of detection over the whole image while the subject is in view
+SEARCH_EVERY_NS = 300_000_000  # without one, interval of a bystander's poses, and longest gap of one to look at closely
 _ISOLATED = 0.4  # free margin around an isolated subject, lengths
 _REDUCED_INPUT = 0.8  # under load shedding, share of the detector's input for a window
-_CANDIDATE_S = 0.3  # longest gap of a person that the search without a subject centres on
 _WIDER_PER_S = 0.5  # growth of the search around the last place of a lost subject, lengths per second,
 _WIDEST = 2.0  # and its farthest reach, lengths
-_EDGE = 0.01  # share of the image's longer side within which a box is at its edge
 _CUT_PX = 2.0  # distance from a window's edge below which a box is cut
 
 
@@ -90,7 +87,7 @@ class SubjectSearch:
             return False
         around = predicted + _ISOLATED * subject.filter.length * np.array([-1, -1, 1, 1])
         others = [p.filter.box_at(stamp_ns) for p in self._tracker.persons if p is not subject and p.plausible]
-        edge = _EDGE * max(image_size)
+        edge = EDGE * max(image_size)
         at_edge = (predicted[:2] < edge).any() or (predicted[2:] > np.array(image_size) - edge).any()
         return not ((overlap_coefficient(around[None], np.array(others).reshape(-1, 4)) > 0).any() or at_edge)
 
@@ -125,7 +122,7 @@ class SubjectSearch:
         self, subject: Person, found: Detections, image_size: tuple[int, int], stamp_ns: int
     ) -> Window | None:
         """Window in which a subject that the last image did not show may be, if it is in none of the boxes; or None."""
-        if not self._tracker.missed or _overlaps(subject.filter.box_at(stamp_ns), found.boxes, _AT_PLACE):
+        if not self._tracker.missed or _overlaps(subject.filter.box_at(stamp_ns), found.boxes, PARTLY):
             return None
         return window_around(subject.sought_box(stamp_ns), image_size, WIDE)
 
@@ -135,10 +132,10 @@ class SubjectSearch:
         """Tight window around a subject that the detections do not show clearly, or None."""
         box = subject.filter.box_at(stamp_ns)
         clear = found.boxes[found.scores >= self._config.detection_threshold]
-        return None if _overlaps(box, clear, _CLEAR_IOU) else window_around(box, image_size, TIGHT)
+        return None if _overlaps(box, clear, MOSTLY) else window_around(box, image_size, TIGHT)
 
     def _full_image_due(self, stamp_ns: int) -> bool:
-        return self._full_ns is None or stamp_ns - self._full_ns >= _FULL_EVERY_NS
+        return self._full_ns is None or stamp_ns - self._full_ns >= FULL_EVERY_NS
 
     def _anywhere(
         self, places: list[np.ndarray], image_size: tuple[int, int], stamp_ns: int, single: bool
@@ -173,7 +170,7 @@ class SubjectSearch:
     def _possible_subject(self, stamp_ns: int) -> Person | None:
         """Who may become the subject: a small person needs a window around it to be confirmed."""
         lost = self._tracker.subject
-        recent = [p for p in self._tracker.persons if p.plausible and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
+        recent = [p for p in self._tracker.persons if p.plausible and stamp_ns - p.detected_ns <= SEARCH_EVERY_NS]
         if lost is not None:  # persons in view together with the subject cannot be the subject
             recent = [p for p in recent if p is not lost and could_be(lost, p)]
         return max(recent, key=lambda p: (p.hits < self._config.confirm_frames, p.mean_score), default=None)

@@ -8,22 +8,24 @@ from enum import Enum
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import iou, overlap_coefficient
+from drocap_ros.perception.detection.detector import Detections
+from drocap_ros.perception.detection.nms import MOSTLY, PARTLY, TOUCHES, iou, overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import (
     FORGET_S,
     MARGIN,
     ONE_PERSON,
-    Seen,
     assign,
     followed_on,
     found_again,
     is_someone_else,
     look_cost,
+    mixed,
     place_cost,
 )
 from drocap_ros.perception.tracking.choice import SubjectChoice
 from drocap_ros.perception.tracking.person import (
+    DOUBT_S,
     SURE_CONFIDENCE,
     BoxFilter,
     Person,
@@ -34,19 +36,13 @@ from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorCo
 
 _USUAL = 0.9  # share of the usual belief in a pose below which its box counts less,
 _LEAST_BELIEF = 0.05  # as if it had this one at least
-SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same
-_HIDDEN_IOU = 0.25  # overlap with another person from which a predicted box counts as hidden
-_MEETS = 0.3  # overlap coefficient from which the subject meets someone,
-_MET_NS = 3_000_000_000  # time after it in which either may be taken for the other,
-_EXCHANGED = 2.5  # and difference of the looks' costs from which they were
-_SECOND_IOU = 0.35  # overlap above which a detection of its look is a second box of the subject
-_APART = 0.5  # overlap coefficient below which two boxes hold two persons, if each holds one
-_ROI_IOU = 0.1  # overlap with the subject below which a box of the drone's tracker is another choice
+_SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same: at a half, one around two is not
+_EXCHANGED = 2.5  # difference of the looks' costs of two who met from which they were exchanged
 _MOST_CHANGES = 1000  # kept of a run that may last for days
 _BYSTANDER_S = 2.0  # longest gap of a bystander
 _MAX_PERSONS = 30  # in memory: the assignment's time grows with their number
 _LEAVING_SPEED = 0.15  # outward speed, lengths/s, of a box at the image's edge that counts as leaving
-_EDGE = 0.01  # share of the image's longer side within which a box is at its edge
+EDGE = 0.01  # share of the image's longer side within which a box is at its edge
 
 
 class Change(Enum):
@@ -74,6 +70,8 @@ class SubjectTracker:
         self.subject: Person | None = None  # the last one, lost or not
         #: Lost subjects and their track ids, after whom the rule chose the next one: whoever comes back is it again.
         self._away: list[tuple[int, Person]] = []
+        #: Persons whose joints were followed, out of view.
+        self.lost: list[Person] = []
         self._track_id = self._last_id = 0
         self._is_shown = False
         #: The last changes of the subject, stamp and words; an exchange keeps the person and is none.
@@ -82,16 +80,16 @@ class SubjectTracker:
         self._coast_s = config.coast_s
         self._last_ns: int | None = None
         #: Detections of the last image that are nobody's.
-        self._free = Seen(np.empty((0, 4)), np.empty(0), [])
+        self._free = Detections(np.empty((0, 4)), np.empty(0))
 
     def reset(self) -> None:
         """Delete all tracks, for stamps that restarted; track ids continue."""
         self.persons, self.subject, self.choice.nothing_yet, self._last_ns = [], None, True, None
-        self._away = []
+        self._away, self.lost = [], []
 
     def move_camera(self, matrix: np.ndarray) -> None:
         """Let all persons follow the image's motion (2, 3) by the camera's, those out of view as well."""
-        for person in (*self.persons, *(away for _, away in self._away)):
+        for person in (*self.persons, *self.lost, *(away for _, away in self._away)):
             person.move_camera(matrix)
 
     def followed(self, stamp_ns: int) -> Person | None:
@@ -111,7 +109,7 @@ class SubjectTracker:
     def apart(self, person: Person) -> bool:
         """Whether the boxes of a person and of the subject hold two persons, if each holds one."""
         subject = self.subject
-        return subject is None or bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
+        return subject is None or bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < MOSTLY)
 
     @property
     def missed(self) -> bool:
@@ -127,7 +125,7 @@ class SubjectTracker:
             return Subject(self._track_id, subject.box, subject.score, False)
         box, confirmed = subject.filter.box(), [p for p in self.persons if p.confirmed_ns == stamp_ns]
         hiding = boxes_of(p for p in confirmed if p is not subject and p.plausible)
-        return Subject(self._track_id, box, 0.0, bool((iou(box[None], hiding) > _HIDDEN_IOU).any()))
+        return Subject(self._track_id, box, 0.0, bool((iou(box[None], hiding) > PARTLY).any()))
 
     def predict(self, stamp_ns: int) -> Subject | None:
         """The predicted subject; None unless the last update confirmed it."""
@@ -160,7 +158,7 @@ class SubjectTracker:
         They are the person without the shadow or someone else beside it, or the whole person.
         """
         shared = overlap_coefficient(self._free.boxes, subject.box[None])[:, 0] > ONE_PERSON
-        same = iou(self._free.boxes, subject.box[None])[:, 0] > SAME_BOX_IOU
+        same = iou(self._free.boxes, subject.box[None])[:, 0] > _SAME_BOX_IOU
         order = np.argsort(-self._free.scores, kind="stable")
         return [(self._free.boxes[j], float(self._free.scores[j])) for j in order if shared[j] and not same[j]]
 
@@ -249,10 +247,10 @@ class SubjectTracker:
         self._last_ns = stamp_ns
         for person in self.persons:
             person.filter.predict(stamp_ns)
-        seen = Seen(boxes.astype(float), scores, [describe(image, box) for box in boxes])
+        seen = Detections(boxes.astype(float), scores, appearances=[describe(image, box) for box in boxes])
         assigned = self._assign(seen, stamp_ns)
         free = [j for j in range(len(boxes)) if j not in assigned]
-        self._free = Seen(seen.boxes[free], scores[free], [seen.appearances[j] for j in free])
+        self._free = Detections(seen.boxes[free], scores[free])
         self._spawn(seen, assigned, stamp_ns)
         self._reidentify(stamp_ns)
         if look is not None and self.current(stamp_ns) is None:
@@ -268,13 +266,13 @@ class SubjectTracker:
         self._is_shown = shown is not None
         return shown
 
-    def _assign(self, seen: Seen, stamp_ns: int) -> set[int]:
+    def _assign(self, seen: Detections, stamp_ns: int) -> set[int]:
         """Update everybody with their detections; returns the indices of these."""
         persons = followed_on(self.subject, self.persons, self._coast_s, stamp_ns)
         if (subject := self.followed(stamp_ns)) is not None:
             persons = [subject, *persons]
         persons = [p for p in persons if p.detected_ns < stamp_ns]
-        pairs, mixed = assign(persons, seen), seen.mixed()
+        pairs, blended = assign(persons, seen), mixed(seen)
         for i, j in pairs:
             person = persons[i]
             person.update(seen.boxes[j], float(seen.scores[j]), stamp_ns)
@@ -283,7 +281,7 @@ class SubjectTracker:
                 person.confirm(stamp_ns)
             if person.pose.believed:
                 # Beside the subject either may be taken for the other: what is known of them stays.
-                lasting = not mixed[j] and stamp_ns - person.met_ns > _MET_NS
+                lasting = not blended[j] and stamp_ns - person.met_ns > 1e9 * DOUBT_S
                 person.update_appearance(seen.appearances[j], lasting)
         for person in persons:
             person.searched(person.detected_ns == stamp_ns)
@@ -297,11 +295,11 @@ class SubjectTracker:
         In each image the places count more than the looks; what the looks say adds up over the images.
         """
         for person in self.detected(stamp_ns):
-            if overlap_coefficient(person.box[None], subject.box[None])[0, 0] > _MEETS:
+            if overlap_coefficient(person.box[None], subject.box[None])[0, 0] > PARTLY:
                 person.met_ns = subject.met_ns = stamp_ns
             # Of a track that began at the meeting no look is known but the one it has now.
-            new = stamp_ns - person.first_ns <= _MET_NS
-            met = stamp_ns - max(person.met_ns, subject.met_ns if new else 0) <= _MET_NS
+            new = stamp_ns - person.first_ns <= 1e9 * DOUBT_S
+            met = stamp_ns - max(person.met_ns, subject.met_ns if new else 0) <= 1e9 * DOUBT_S
             if not met or person.hits < self._config.confirm_frames:
                 continue
             own, other = (look_cost(p, [subject.recent, person.recent]) for p in (subject, person))
@@ -320,7 +318,7 @@ class SubjectTracker:
         person.left_image = False
         self.changes.append((self._last_ns or 0, f"person {track_id} {change.value}"))
 
-    def _spawn(self, seen: Seen, assigned: set[int], stamp_ns: int) -> None:
+    def _spawn(self, seen: Detections, assigned: set[int], stamp_ns: int) -> None:
         """Start tracks from unassigned detections, except parts of tracked persons and second boxes of the subject."""
         # Leaves and signs that were found to be no person may cover one.
         known = boxes_of(p for p in self.persons if p.detected_ns == stamp_ns and p.plausible)
@@ -331,7 +329,7 @@ class SubjectTracker:
                 continue
             if subject is not None and not is_someone_else(subject, seen.appearances[j]):
                 here = subject.box if subject.detected_ns == stamp_ns else subject.filter.box()
-                if iou(box, here[None])[0, 0] > _SECOND_IOU or overlap_coefficient(box, here[None])[0, 0] > ONE_PERSON:
+                if iou(box, here[None])[0, 0] > PARTLY or overlap_coefficient(box, here[None])[0, 0] > ONE_PERSON:
                     continue
             self.persons.append(Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j]))
 
@@ -359,7 +357,7 @@ class SubjectTracker:
     def _apply_roi(self, roi: np.ndarray, stamp_ns: int) -> None:
         """A roi away from the subject is a choice; one on the subject replaces missing detections."""
         subject = self.subject
-        if subject is None or iou(roi[None], subject.filter.box()[None])[0, 0] < _ROI_IOU:
+        if subject is None or iou(roi[None], subject.filter.box()[None])[0, 0] < TOUCHES:
             self.choice.box = roi
         elif self._config.subject == "roi" and subject.unconfirmed_s(stamp_ns) > 0.5 * self._coast_s:
             subject.update(roi, 0.0, stamp_ns)
@@ -389,16 +387,25 @@ class SubjectTracker:
         if subject is not None:
             subject.left_image = subject.undetected_s(stamp_ns) > 0 and (subject.left_image or _leaving(subject, shape))
             subject.others = {p for p in subject.others if p.undetected_s(stamp_ns) <= FORGET_S}
-        kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S]
+        here = boxes_of(self.detected(stamp_ns))
+        kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S or _behind(p, here)]
+        gone = [p for p in self.persons if p.joints is not None and p not in kept]
+        self.lost = [p for p in (*self.lost, *gone) if p.unconfirmed_s(stamp_ns) <= FORGET_S]
         if len(kept) > _MAX_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))
         self.persons = kept[:_MAX_PERSONS]
 
 
+def _behind(person: Person, others: np.ndarray) -> bool:
+    """Whether the joints of a person are expected behind somebody in boxes (N, 4) px, where they stay until then."""
+    joints = person.joints
+    return joints is not None and bool((overlap_coefficient(joints.box[None], others) > MOSTLY).any())
+
+
 def _leaving(person: Person, image_shape: tuple[int, ...]) -> bool:
     """Whether the person's last box touches an edge of the image and moves outwards."""
     height, width = image_shape[:2]
-    edge = _EDGE * max(width, height)
+    edge = EDGE * max(width, height)
     x0, y0, x1, y1 = person.box
     vx, vy = person.filter.x[:2, 1] / person.filter.length
     out = ((x0 < edge, -vx), (x1 > width - edge, vx), (y0 < edge, -vy), (y1 > height - edge, vy))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.cli import main
-from drocap_ros.errors import InputError, ParameterError
+from drocap_ros.errors import InputError
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import limited_use, models_folder
 from drocap_ros.perception.models.runtime import OnnxModel
@@ -139,13 +139,6 @@ def test_use_of_the_simulation_networks_is_reported(caplog, capsys):
     assert "body15" in capsys.readouterr().out
 
 
-def test_model_list_separates_them_from_the_models_of_the_user(tmp_path, capsys):
-    assert main(["models", "list", "--models", str(tmp_path)]) == 0
-    out = capsys.readouterr().out
-    assert "no models" in out
-    assert out.index("used only with") < out.index("person_detector.onnx")
-
-
 def test_missing_models_do_not_fall_back_to_them(tmp_path, monkeypatch):
     monkeypatch.delenv("DROCAP_MODELS", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
@@ -181,13 +174,6 @@ def run_command(folder, *words):
     return args.run(args)
 
 
-@pytest.mark.parametrize("words", [["--threads", "0"], ["--minutes", "-1"], ["--steps", "-1"], ["--seed", "-2"]])
-def test_invalid_training_options_are_refused(tmp_path, words):
-    with pytest.raises((InputError, ParameterError), match="expected"):
-        run_command(tmp_path / "m", *words)
-    assert not (tmp_path / "m").exists()
-
-
 def test_short_training_writes_networks_that_run(tmp_path, capsys):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
@@ -200,14 +186,6 @@ def test_short_training_writes_networks_that_run(tmp_path, capsys):
     assert "sigma_scale: " in (tmp_path / "m" / "person_pose.yaml").read_text()
     image = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
     assert estimator.pose_model.estimate(image, np.array([50.0, 20, 150, 200])).xy.shape == (15, 2)
-
-
-def test_one_network_can_be_trained_alone(tmp_path, capsys):
-    pytest.importorskip("torch", reason="the extra 'train' is not installed")
-    pytest.importorskip("onnx", reason="the extra 'train' is not installed")
-    assert run_command(tmp_path / "m", "--steps", "1", "--only", "detector") == 0
-    assert "1 batches of the detector, 0 of the pose network" in capsys.readouterr().out
-    assert [f.name for f in (tmp_path / "m").iterdir()] == ["person_detector.onnx"]
 
 
 def test_a_box_has_positive_cells_of_one_stride_alone():

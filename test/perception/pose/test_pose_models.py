@@ -153,7 +153,7 @@ def test_one_stage_model_gives_the_person_in_the_box(tmp_path):
 def test_crop_holds_the_box_and_is_invertible(x, y, width, height):
     box = np.array([x, y, x + width, y + height])
     crop = crop_around(box, (192, 256), 1.25)
-    edges = (box.reshape(2, 2) - crop.centre) * crop.scale + np.array(crop.size) / 2
+    edges = (box.reshape(2, 2) - 0.5 - crop.origin) * crop.scale + np.array(crop.size) / 2
     assert (edges > -1e-3).all()
     assert (edges < np.array(crop.size) + 1e-3).all()
     # A pixel's middle stands at a whole number, half a pixel from its edges.

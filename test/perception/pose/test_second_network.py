@@ -43,7 +43,7 @@ def second(folder, pose, places):
     for name in COCO_21.joints:
         side, _, part = name.partition("_")
         ours = f"{side[0]}{NAMES.get(part, part)}"
-        x, y = (np.array(places.get(ours, places["head"])) - np.array(crop.centre)) * crop.scale / 256 + 0.5
+        x, y = (np.array(places.get(ours, places["head"])) - (np.array(crop.origin) + 0.5)) * crop.scale / 256 + 0.5
         rows.append((y, x, 0.9))
     space = np.arange(63, dtype=np.float32).reshape(1, 21, 3)
     outputs = {"out": np.array(rows, np.float32)[None, None], "space": space}

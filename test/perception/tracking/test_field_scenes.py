@@ -40,7 +40,7 @@ class Script:
         self.truth: list[tuple[np.ndarray, np.ndarray | None]] = []
         estimator.detector.detect = self.detect
         estimator.pose_model.estimate = self.estimate
-        estimator._body.joint_map = self
+        estimator.body.joint_map = self
 
     def detect(self, image, window=None, threshold=0.3, reduced=None) -> Detections:
         x0, y0, x1, y1 = window or (0, 0, image.shape[1], image.shape[0])

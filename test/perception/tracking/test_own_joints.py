@@ -7,8 +7,7 @@ from people_scenes import PeopleScene, camera_of, people_of
 
 from drocap_ros.perception.pose.body_pose import BodyPose
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
-from drocap_ros.perception.tracking.own_joints import BodyTrack, Poses, contested, own_joints
-from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.own_joints import ExpectedJoints, Poses, own_joints
 from drocap_ros.skeleton import BODY_15
 
 SCENE = PeopleScene("cross", 1)
@@ -22,13 +21,12 @@ def pose_of(xy: np.ndarray) -> BodyPose:
     return BodyPose(xy.astype(float), np.ones((15, 3)), np.full(15, 0.95), network)
 
 
-def tracks_up_to(frame: int, who: tuple[int, ...]) -> list[BodyTrack]:
+def tracks_up_to(frame: int, who: tuple[int, ...]) -> list[ExpectedJoints]:
     """Tracks that have seen every image before ``frame`` and expect the joints in it."""
     found = []
     for k in who:
         xy = TRUTH[k]
-        box = np.concatenate([xy[0].min(axis=0), xy[0].max(axis=0)])
-        track = BodyTrack(Person(box, 0.8, int(TIMES[0]), None), pose_of(xy[0]), BODY_15, int(TIMES[0]))
+        track = ExpectedJoints(pose_of(xy[0]), BODY_15, int(TIMES[0]))
         for i in range(1, frame):
             track.predict(int(TIMES[i]))
             track.accept(xy[i], np.ones(15, bool), believed=True)
@@ -48,27 +46,27 @@ def poses(*xy: np.ndarray) -> Poses:
 
 def test_own_poses_stay_with_their_bodies_where_two_cross() -> None:
     for frame, least in ((nearest(0, 1), 0.6), (nearest(0, 1) - 3, 0.85)):  # joints at one place are nobody's
-        owned = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[0][frame], TRUTH[1][frame]))
-        assert owned.pose.tolist() == [0, 1]
+        pose, joint = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[0][frame], TRUTH[1][frame]))
+        assert pose.tolist() == [0, 1]
         for k in (0, 1):
-            assert (owned.joint[k] >= 0).mean() > least
-            assert not (owned.joint[k] == 1 - k).any()
+            assert (joint[k] >= 0).mean() > least
+            assert not (joint[k] == 1 - k).any()
 
 
 def test_poses_that_the_boxes_exchanged_go_back() -> None:
     frame = nearest(0, 1) - 4
-    owned = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[1][frame], TRUTH[0][frame]))
-    assert owned.pose.tolist() == [1, 0]
+    pose, _ = own_joints(tracks_up_to(frame, (0, 1)), poses(TRUTH[1][frame], TRUTH[0][frame]))
+    assert pose.tolist() == [1, 0]
 
 
 def test_one_body_in_both_boxes_is_that_of_whom_it_fits() -> None:
     frame = nearest(0, 1) - 4
     for front in (0, 1):
         twice = poses(TRUTH[front][frame], TRUTH[front][frame] + 0.5)
-        owned = own_joints(tracks_up_to(frame, (0, 1)), twice)
-        assert owned.pose[front] >= 0
-        assert owned.pose[1 - front] == -1
-        assert (owned.joint[1 - front] == -1).all()
+        pose, joint = own_joints(tracks_up_to(frame, (0, 1)), twice)
+        assert pose[front] >= 0
+        assert pose[1 - front] == -1
+        assert (joint[1 - front] == -1).all()
 
 
 def test_wrist_on_another_body_is_dropped() -> None:
@@ -76,10 +74,10 @@ def test_wrist_on_another_body_is_dropped() -> None:
     wrist = BODY_15.index("lwrist")
     borrowed = TRUTH[0][frame].copy()
     borrowed[wrist] = TRUTH[1][frame, wrist]
-    owned = own_joints(tracks_up_to(frame, (0, 1)), poses(borrowed, TRUTH[1][frame]))
-    assert owned.joint[0, wrist] == -1
-    assert owned.joint[1, wrist] == 1
-    assert (np.delete(owned.joint[0], wrist) >= 0).sum() >= 12
+    _, joint = own_joints(tracks_up_to(frame, (0, 1)), poses(borrowed, TRUTH[1][frame]))
+    assert joint[0, wrist] == -1
+    assert joint[1, wrist] == 1
+    assert (np.delete(joint[0], wrist) >= 0).sum() >= 12
 
 
 def test_one_gap_is_as_long_as_many_images_without_the_person() -> None:
@@ -90,27 +88,3 @@ def test_one_gap_is_as_long_as_many_images_without_the_person() -> None:
     left_out.predict(hidden.stamp_ns)
     apart = np.linalg.norm(left_out.xy - hidden.xy, axis=1)
     assert (apart < 0.15 * np.linalg.norm(hidden.xy - tracks_up_to(10, (0,))[0].xy, axis=1)).all()
-
-
-def test_length_is_that_of_the_joints_in_a_box_around_two_persons() -> None:
-    both = np.concatenate([TRUTH[0][0], TRUTH[1][0]])
-    one, two = (np.concatenate([xy.min(axis=0), xy.max(axis=0)]) for xy in (TRUTH[0][0], both))
-    assert np.ptp(two.reshape(2, 2), axis=0).max() > 1.5 * np.ptp(one.reshape(2, 2), axis=0).max()
-    alone, merged = (
-        BodyTrack(Person(box, 0.8, int(TIMES[0]), None), pose_of(TRUTH[0][0]), BODY_15, int(TIMES[0])).length
-        for box in (one, two)
-    )
-    assert merged == alone
-
-
-def test_images_before_and_after_show_a_borrowed_joint() -> None:
-    frame = nearest(0, 1)
-    ankle = BODY_15.index("rankle")
-    seen = [xy.copy() for xy in TRUTH[:2]]
-    far = frame - 8  # the bodies are apart, the joint is not
-    seen[0][far, ankle] = seen[1][far, ankle]
-    length = [np.full(len(TIMES), 200.0)] * 2
-    found = contested(seen, TIMES, length)
-    assert found[0][far, ankle]
-    assert not found[1][far, ankle]
-    assert found[0].mean() < 0.02

@@ -7,7 +7,7 @@ import pytest
 
 from drocap_ros.errors import ParameterError
 from drocap_ros.perception.detection.detector import Detections
-from drocap_ros.perception.tracking.association import Seen, assign, could_be
+from drocap_ros.perception.tracking.association import assign, could_be
 from drocap_ros.perception.tracking.other_poses import due_bystanders
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
@@ -87,7 +87,7 @@ def test_half_hidden_subject_takes_its_own_detection_when_the_cover_goes_away():
     boxes = np.array([[720.0, 344, 749, 465], [691, 353, 740, 472]])
     for person in (subject, front):
         person.filter.predict(100_000_000)
-    pairs = assign([subject, front], Seen(boxes, np.array([0.6, 0.7]), [None, None]))
+    pairs = assign([subject, front], Detections(boxes, np.array([0.6, 0.7]), appearances=[None, None]))
     assert sorted(pairs) == [(0, 0), (1, 1)]
 
 
@@ -96,7 +96,7 @@ def test_detection_near_the_subject_is_not_a_person_from_far_away():
     subject, other = (Person(np.array(box), 0.8, 0, None) for box in ([848.0, 214, 1051, 361], [345.0, 516, 606, 945]))
     for person in (subject, other):
         person.filter.predict(867_000_000)
-    found = Seen(np.array([[898.0, 182, 1177, 481]]), np.array([0.54]), [None])
+    found = Detections(np.array([[898.0, 182, 1177, 481]]), np.array([0.54]), appearances=[None])
     assert assign([subject, other], found) == [(0, 0)]
 
 
