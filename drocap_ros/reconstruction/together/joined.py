@@ -128,7 +128,7 @@ def _results(problem: JoinedProblem, refined: RefinedWorld, names: list[str]) ->
         stamp_ns, rows = problem.images(n)
         rotation, position = (values[rows] for values in problem.camera(n, inputs[n], refined))
         keypoints, seen = (values[rows] for values in problem.shown(n, inputs[n]))
-        joints, alone = refined.joints[rows], view.solved.motion.meta
+        joints, own = refined.joints[rows], view.solved.motion.meta
         calibration: dict[str, object] = {"calibration": refined.calibration, "covariance_about": "origin"}
         motion = Motion(
             joints3d=joints / scale,
@@ -142,7 +142,7 @@ def _results(problem: JoinedProblem, refined: RefinedWorld, names: list[str]) ->
             confidence=seen,
             keypoints=keypoints,
             reprojection_px=reprojection_px(joints, rotation, position, view.camera.matrix, keypoints),
-            meta={**alone, **calibration, "frames": len(rows), "together": together},
+            meta={**own, **calibration, "frames": len(rows), "together": together},
             camera_position=position / scale,
             covariance=refined.covariance[rows] / scale**2,
         )
