@@ -151,7 +151,8 @@ def add_clip_options(parser: argparse.ArgumentParser) -> None:
         "--subject",
         metavar="N|RULE",
         default="",
-        help="number of a person in the picture of `drocap track --list`, or several, as 1,3; or largest (default),"
+        help="number of a person in the picture of `drocap track --list`, or in a file of keypoints by the frames that"
+        " show him, or several, as 1,3; or largest (default),"
         " centre, or a box x_min,y_min,x_max,y_max px in the first image",
     )
     parser.add_argument(

@@ -184,7 +184,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     telemetry = _telemetry(args)
     with (
-        as_tracks_file(args.input, Stated(args.rate, args.image_size, args.order)) as source,
+        as_tracks_file(args.input, Stated(args.rate, args.image_size, args.order, person)) as source,
         progress_bars(args.quiet, _SHARES) as progress,
     ):
         if needs_networks(source, args.redetect):
@@ -193,7 +193,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
             raise InputError(
                 f"--topic {args.topic}: expected images, found recorded 2D poses; add --redetect, or leave it out"
             )
-        rate_hz = args.rate if source == args.input else None
+        rate_hz, person = (args.rate, person) if source == args.input else (None, None)
         selection = Selection(
             clip, person, args.redetect, args.topic, rate_hz, args.evidence, people or (), args.threads
         )

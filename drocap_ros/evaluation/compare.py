@@ -138,7 +138,9 @@ def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]
     """
     if not isinstance(truth, Motion):
         path = motion_file(truth, *(f"truth{suffix}" for suffix in TRUTH_SUFFIXES))
-        if path.is_file() and (found := read_truth_file(path)) is not None:
+        name, sign, subject = path.name.rpartition("#")
+        path, subject = (path.with_name(name), subject) if sign and not path.exists() else (path, "")
+        if path.is_file() and (found := read_truth_file(path, subject)) is not None:
             return *found, "world"
         if path.is_file() and path.suffix.lower() != ".npz":
             raise InputError(

@@ -70,8 +70,11 @@ class _Points(NamedTuple):
     up: str
 
 
-def read_truth_file(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Joints (T, 17, 3) m, z up, NaN unknown, and their times (T,) s; None of a file that is none of these."""
+def read_truth_file(path: Path, subject: str = "") -> tuple[np.ndarray, np.ndarray] | None:
+    """Joints (T, 17, 3) m, z up, NaN unknown, and their times (T,) s; None of a file that is none of these.
+
+    subject : name before the joints' names, where a file holds several bodies; empty: the one with fewest gaps
+    """
     try:
         with path.open("rb") as file:
             head = file.read(64).removeprefix(b"\xef\xbb\xbf")
@@ -81,7 +84,7 @@ def read_truth_file(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
         if path.stat().st_size > _MAX_BYTES:
             raise InputError(f"expected at most {_MAX_BYTES >> 20} MiB, found more; cut the file")
         with np.errstate(all="ignore"):
-            return _on_the_body(path, reader(path))
+            return _on_the_body(path, _of_subject(path, reader(path), subject))
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; {error.strerror or error}") from None
     except InputError as error:
@@ -104,6 +107,25 @@ def body_joints(names: list[str]) -> dict[str, int]:
             if place is not None:
                 found.setdefault(side + part, place)
     return found
+
+
+def _of_subject(path: Path, points: _Points, wanted: str) -> _Points:
+    """The points of one of several bodies, whose names stand before a colon or bar."""
+    owners = [re.match(r"(.*)[:|]", name) for name in points.names]
+    columns: dict[str, list[int]] = {}
+    for i, owner in enumerate(owners):
+        columns.setdefault(owner[1].strip() if owner else "", []).append(i)
+    bodies = {name: of for name, of in columns.items()
+              if set(LIMB_JOINTS) <= body_joints([points.names[i] for i in of]).keys()}  # fmt: skip
+    if wanted and wanted not in bodies:
+        raise InputError(f"expected a body named {wanted!r}, found {', '.join(bodies) or 'none'}; correct the name")
+    if len(bodies) < 2:
+        return points
+    seen = {name: int(np.isfinite(points.positions[:, of]).all(axis=2).sum()) for name, of in bodies.items()}
+    best = wanted or max(seen, key=lambda name: seen[name])
+    logger.warning("%s: several bodies, %s: %s is used, %s#NAME is another", path, ", ".join(bodies), best, path.name)
+    own = bodies[best]
+    return points._replace(names=[points.names[i] for i in own], positions=points.positions[:, own])
 
 
 def _on_the_body(path: Path, points: _Points) -> tuple[np.ndarray, np.ndarray]:
@@ -246,7 +268,12 @@ def _read_bvh(path: Path) -> _Points:
     except (StopIteration, ValueError, IndexError) as error:
         raise InputError(f"expected a BVH file that can be read; {first_line(error) or 'it ends early'}") from None
     time_s = _even_times(count, 1.0 / step if step > 0 else 0.0)
-    return _Points([bone.name for bone in bones], _kinematics(bones, values), time_s, "cm", "Y")
+    roots = [bone.name for bone in bones if bone.parent < 0]
+    names, owner = [], ""
+    for bone in bones:
+        owner = f"{bone.name}:" if bone.parent < 0 and len(roots) > 1 else owner
+        names.append(owner + bone.name)
+    return _Points(names, _kinematics(bones, values), time_s, "cm", "Y")
 
 
 def _hierarchy(words: Iterator[str]) -> list[_Bone]:

@@ -185,6 +185,19 @@ def test_a_file_of_skin_markers_alone_is_refused_in_words(tmp_path, world, prefi
         load_truth(path)
 
 
+@pytest.mark.parametrize("names", [["Anna", "Ben"], ["s1", "s2", "s3"]])
+def test_one_of_several_bodies_is_named_and_another_chosen(tmp_path, world, names, caplog):
+    x = world.joints3d[:, LIMBS]
+    both = np.concatenate([x + np.array([2.0 * i, 0, 0]) for i in range(len(names))], axis=1)
+    both[:5, : len(LIMBS)] = np.nan  # of the first body
+    path = trc(tmp_path / "truth.trc", [f"{name}:{joint}" for name in names for joint in LIMB_JOINTS], both)
+    first, second = load_truth(path)[0], load_truth(f"{path}#{names[0]}")[0]
+    assert f"several bodies, {', '.join(names)}: {names[1]} is used" in caplog.text
+    assert np.allclose(first[5:, LIMBS] - second[5:, LIMBS], [2.0, 0, 0], atol=1e-5)
+    with pytest.raises(InputError, match="expected a body named 'Eve'"):
+        load_truth(f"{path}#Eve")
+
+
 @pytest.mark.parametrize("name", ["truth.fbx", "truth.csv", "truth.mp4", "truth"])
 def test_a_truth_of_another_kind_names_those_that_are_read(tmp_path, name):
     (tmp_path / name).write_bytes(b"Kaydara FBX Binary  \x00\x1a\x00")

@@ -36,6 +36,8 @@ _MAX_ASPECT = 4
 _NS = 10**9
 #: Bounds against damaged files: boxes at one level, and the bytes of an index of hours.
 _MAX_BOXES, _MAX_INDEX = 4096, 1 << 26
+#: Keys of the rate at which a phone recorded, and how much faster than the video's it must be for slow motion.
+_CAPTURE_RATES, _SLOW = ("com.android.capture.fps", "com.apple.quicktime.capture.fps", "capture_fps"), 1.5
 #: Codecs of messages' packets by their names there.
 _CODECS = {r"[hx]\.?264|avc": "h264", r"[hx]\.?265|hevc": "hevc", "vp9": "vp9", "av1": "av1", "mjpe?g": "mjpeg"}
 
@@ -183,6 +185,7 @@ class VideoSource(ImageSource):
         self._decoder = Decoder(self._stream.codec_context, _time_base(self._stream), self._stream.sample_aspect_ratio)
         rate = float(self._stream.guessed_rate or 0)
         self._rate_hz = rate if 0.1 < rate < 1000 else 30.0
+        self._tell_slow_motion()
         self._stated_s = stated_s(self._container, self._stream)
         self.length = self._stated_length()
         self.duration_s = (self.length - 1) / self._rate_hz if self.length else None
@@ -191,6 +194,16 @@ class VideoSource(ImageSource):
         if first is None:
             raise self._refused(f"{self._stream.codec_context.codec.long_name} without a frame that it decodes")
         self.size = (first.image.shape[1], first.image.shape[0])
+
+    def _tell_slow_motion(self) -> None:
+        """A line where the camera says that it took more images a second than the video shows, as phones do."""
+        stated = [self._container.metadata.get(key, "") for key in _CAPTURE_RATES]
+        rates = [float(text) for text in stated if re.fullmatch(r"\d{1,4}(\.\d+)?", text)]
+        if rates and rates[0] > _SLOW * self._rate_hz:
+            log.warning(
+                "%s: slow motion: recorded at %g images a second, shown at %.4g; --rate %g gives the true times",
+                *(self.path, rates[0], self._rate_hz, rates[0]),
+            )
 
     def _chosen(self, streams: list[VideoStream]) -> VideoStream:
         tracks = {str(number): stream for number, stream in enumerate(streams, 1)}

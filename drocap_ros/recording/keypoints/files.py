@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import json
 import logging
 import re
 import tempfile
@@ -21,13 +20,12 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
+from drocap_ros.recording.keypoints.frames import Label, natural, numbers_of, one_person, rate_of_times
 from drocap_ros.recording.keypoints.orders import counts, name_points
-from drocap_ros.recording.keypoints.tables import is_keypoint_table, read_table
+from drocap_ros.recording.keypoints.tables import is_keypoint_table, read_json, read_table
 from drocap_ros.tracks import MAX_FRAMES, Tracks, kind_of, load_tracks, read_npz, save_tracks, without_unseen
 
 Value = TypeVar("Value")
-#: A frame's name or number, or a person's; None = not stated.
-Label = str | int | float | None
 #: An object of JSON.
 Node = Mapping[str, object]
 #: Keys of a person's points, their scores, a frame, a person, all persons of one frame, the rate.
@@ -37,12 +35,12 @@ _FRAME = ("frame_id", "image_id", "frame_index", "frame", "image_name", "file_na
 _WHO = ("track_id", "idx", "person_id", "instance_id")
 _TOGETHER = ("people", "bodies", "instances", "persons", "predictions")
 _RATE = ("fps", "frame_rate", "rate_hz", "framerate")
+#: Keys of a frame's time.
+_TIMES = frozenset(f"{name}{unit}" for name in ("time", "timestamp") for unit in ("", "_s", "_ms", "_us", "_ns"))
 #: Keys of the names of joints, in their order or by their numbers.
 _NAMES = re.compile(r"(key_?points?|joints?|nodes?|body_?parts|landmarks?)_?(names?|labels?|id2name|name2id)|bodyparts")
 #: Keys of poses in space, which are no keypoints of a picture.
 _SPACE = re.compile(r"3d|world|xyz", re.IGNORECASE)
-#: Digits of a frame's number; longer ones are times or sums.
-_LONGEST_NUMBER = 10
 #: A person's least points, and most: whole bodies have 133 or 136, with a mesh of the face 543.
 _LEAST, _MOST = 5, 600
 #: No camera has larger images, px.
@@ -63,6 +61,7 @@ class Content:
     size: tuple[int, int] | None = None
     rate_hz: float | None = None
     pictures: dict[Label, str] = field(default_factory=dict)
+    times: dict[Label, tuple[str, float]] = field(default_factory=dict)
     tool: str = ""
     space: bool = False
 
@@ -106,6 +105,9 @@ def walk(node: object, frame: Label, content: Content) -> None:
 def _walk_object(node: Node, frame: Label, content: Content) -> None:
     content.note(node)
     frame = next((name for key in _FRAME if isinstance(name := node.get(key), int | float | str)), frame)
+    for key in _TIMES & node.keys():
+        with contextlib.suppress(TypeError, ValueError):
+            content.times.setdefault(frame, (key, float(cast("float", node[key]))))
     if (points := _points_of(node, content)) is not None:
         content.add(frame, _first_of(node, _WHO), points)
         return
@@ -215,35 +217,6 @@ def _scored(points: np.ndarray, scores: object) -> np.ndarray | None:
     return found
 
 
-def one_person(people: list[tuple[int, Label, np.ndarray]]) -> dict[int, np.ndarray]:
-    """Points by frame of the person with most frames by its number; of several the largest, then the nearest to it."""
-    most = Counter(who for _, who, _ in people).most_common(1)[0][0]
-    by_frame: dict[int, list[np.ndarray]] = {}
-    for frame, who, points in people:
-        if who == most:
-            by_frame.setdefault(frame, []).append(points)
-    chosen: dict[int, np.ndarray] = {}
-    last: np.ndarray | None = None
-    for frame in sorted(by_frame):
-        sizes = [-np.ptp(p[np.isfinite(p[:, 0]), :2], axis=0).sum() for p in by_frame[frame]]
-        steps = sizes if last is None else [np.nanmedian(np.abs(p - last)[:, :2]) for p in by_frame[frame]]
-        last = chosen[frame] = by_frame[frame][int(np.argmin(np.nan_to_num(steps, nan=np.inf)))]
-    return chosen
-
-
-def _natural(label: Label) -> list[tuple[int, str]]:
-    """Sort key that puts frame_2 before frame_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(label)) if part]
-
-
-def numbers_of(labels: list[Label]) -> dict[Label, int]:
-    """Number of each frame: the last one in its name where that tells frames apart, else its place."""
-    names = list(dict.fromkeys(labels))
-    found = [re.findall(r"\d+", Path(n).stem if isinstance(n, str) else str(n))[-1:] for n in names]
-    numbers = [int(digits[0]) for digits in found if digits and len(digits[0]) < _LONGEST_NUMBER]
-    return dict(zip(names, numbers if len(set(numbers)) == len(names) else range(len(names)), strict=True))
-
-
 def read_arrays(arrays: Mapping[str, np.ndarray], content: Content) -> None:
     """Collect the persons, joints, rate and size of arrays by name."""
     words = {name: array.ravel().astype(str).tolist() for name, array in arrays.items() if array.dtype.kind in "US"}
@@ -292,15 +265,21 @@ def is_keypoint_file(path: Path) -> bool:
         return {p.suffix for p in path.iterdir() if not p.name.startswith(".")} == {".json"}
     if path.suffix.lower() in (".csv", ".tsv") and path.is_file():
         return is_keypoint_table(path)
-    return path.suffix.lower() in (".npz", ".npy", ".json", ".pkl", ".h5")
+    return path.suffix.lower() in (".npz", ".npy", ".json", ".jsonl", ".pkl", ".h5")
 
 
 class Stated(NamedTuple):
-    """What a user says of a file: images per second, their size px, the order of the joints; None where nothing."""
+    """What a user says of a file; None where nothing.
+
+    rate_hz, size : images per second, and their width and height px
+    order : of the joints
+    subject : number of the person by the frames that show him, from 1 on
+    """
 
     rate_hz: float | None = None
     size: tuple[int, int] | None = None
     order: str | None = None
+    subject: int | None = None
 
 
 @contextlib.contextmanager
@@ -338,13 +317,17 @@ def read_keypoints(path: Path, stated: Stated = Stated()) -> Tracks:  # noqa: B0
 
 
 def _content(path: Path, *, own: bool) -> Content | Tracks:
-    content, suffix = Content(), path.suffix.lower()
+    content, suffix, damaged = Content(), path.suffix.lower(), 0
     if path.is_dir():
         for file in sorted(path.glob("[!.]*.json"))[: MAX_FRAMES + 1]:
             content.frames.append(file.stem.removesuffix("_keypoints"))
-            walk(json.loads(file.read_bytes()), content.frames[-1], content)
-    elif suffix == ".json":
-        walk(json.loads(path.read_bytes()), None, content)
+            try:
+                walk(read_json(file)[0], content.frames[-1], content)
+            except ValueError:  # the frame is a gap
+                damaged += 1
+    elif suffix in (".json", ".jsonl"):
+        node, damaged = read_json(path)
+        walk(node, None, content)
     elif suffix in (".csv", ".tsv"):
         walk(list(read_table(path)), None, content)
     elif suffix in _ARRAYS:
@@ -354,13 +337,15 @@ def _content(path: Path, *, own: bool) -> Content | Tracks:
         read_arrays(arrays, content)
     else:
         raise InputError(f"expected keypoints as JSON, CSV, .npz or .npy, found {suffix}; save them as one of these")
+    if damaged and content.people:
+        logger.warning("%s: damaged in %d places: read what is whole", path, damaged)
     return content
 
 
 def _tracks(path: Path, content: Content, stated: Stated) -> Tracks:
     """Tracks of the person in most frames; warns of what is assumed."""
-    frames, points = _series(path, content)
-    rate_hz, size = stated.rate_hz or content.rate_hz, stated.size or content.size
+    frames, points = _series(path, content, stated.subject)
+    rate_hz, size = stated.rate_hz or content.rate_hz or rate_of_times(content.times), stated.size or content.size
     scores, third = np.nan_to_num(points[..., 2]), points[..., 3]
     if scores.max(initial=0.0) > _HIGHEST_SCORE:  # per cent, or a heat map's unit
         scores = scores / scores.max()
@@ -411,7 +396,7 @@ def _pixels(xy: np.ndarray, size: tuple[int, int] | None, spatial: bool) -> np.n
     return xy
 
 
-def _series(path: Path, content: Content) -> tuple[np.ndarray, np.ndarray]:
+def _series(path: Path, content: Content, subject: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (F,) of the frames, and the person's points (F, P, 4), NaN where unseen."""
     counted = Counter(len(points) for _, _, points in content.people)
     if not counted:
@@ -419,16 +404,17 @@ def _series(path: Path, content: Content) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(f"expected 2D keypoints of a person, found {found}")
     count = counted.most_common(1)[0][0]
     frames, people = _by_time(content, count)
-    if len({frame for frame, _, _ in people}) < len(people):
-        logger.warning("%s: several persons, the one in most frames or the largest is reconstructed", path)
-    chosen, missing = one_person(people), np.full((count, 4), np.nan)
+    chosen, words = one_person(people, subject)
+    if words:
+        logger.warning("%s: %s", path, words)
+    missing = np.full((count, 4), np.nan)
     return frames, np.stack([chosen.get(frame, missing) for frame in frames.tolist()])
 
 
 def _by_time(content: Content, count: int) -> tuple[np.ndarray, list[tuple[int, Label, np.ndarray]]]:
     """Numbers (F,) of the frames, gaps filled up, and the persons of ``count`` points by these numbers."""
     labels = {frame: content.pictures.get(frame, frame) for frame in content.frames}
-    numbers = numbers_of(sorted(labels.values(), key=_natural) if content.pictures else content.frames)
+    numbers = numbers_of(sorted(labels.values(), key=natural) if content.pictures else content.frames)
     people = [(numbers[labels[frame]], who, p) for frame, who, p in content.people if len(p) == count]
     frames = np.unique(list(numbers.values()))
     step = np.gcd.reduce(np.diff(frames)) if len(frames) > 1 else 1

@@ -1,15 +1,17 @@
-"""Tables of keypoints as JSON: DeepLabCut's, one row a person (SLEAP, MediaPipe), one row a point."""
+"""JSON of keypoints, whole, by lines or cut off; tables as JSON: DeepLabCut's, one row a person, one row a point."""
 
 from __future__ import annotations
 
 import csv
 import itertools
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TypeAlias
 
 from drocap_ros.errors import InputError
+from drocap_ros.tracks import MAX_FRAMES
 
 #: A frame, or a person in one.
 Frame: TypeAlias = "Mapping[str, object]"
@@ -24,6 +26,49 @@ _AXIS = "x|y|z|score|confidence|conf|likelihood|visibility|v|c|p"
 _COLUMN = re.compile(rf"(.+)[._\- ]({_AXIS})", re.IGNORECASE)
 _TURNED = re.compile(rf"({_AXIS})[._\- ]?(\d+|(?<=[._\- ]).+)", re.IGNORECASE)
 _SCORES = dict.fromkeys(("confidence", "conf", "likelihood", "visibility", "v", "c", "p"), "score")
+
+
+#: What opens and closes in JSON, and texts, in which nothing does.
+_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[{}\[\]]')
+
+
+def read_json(path: Path) -> tuple[object, int]:
+    """Content of a file, and the number of its damaged parts: of lines of JSON, or of one whose rest is missing."""
+    data = path.read_bytes()
+    try:
+        return json.loads(data), 0
+    except (ValueError, RecursionError) as error:
+        text = data.decode("utf-8", "replace")
+        lines = [line for line in text.splitlines() if line.strip()]
+        nodes = [node for line in lines[: MAX_FRAMES + 1] if isinstance(node := _parsed(line), dict | list)]
+        if len(nodes) > len(lines) / 2:
+            return nodes, len(lines) - len(nodes)
+        whole = _parsed(_closed(text[: getattr(error, "pos", 0)]))
+        if whole is None:
+            raise
+        return whole, 1
+
+
+def _parsed(text: str) -> object:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _closed(text: str) -> str:
+    """A text up to its last whole object, with all that is open there closed."""
+    open_ones: list[str] = []
+    end, closing = 0, ""
+    for token in _TOKEN.finditer(text):
+        if token[0] in "{[":
+            open_ones.append("}" if token[0] == "{" else "]")
+        elif token[0] in "}]":
+            if not open_ones or open_ones.pop() != token[0]:
+                break
+            if token[0] == "}" or len(open_ones) < len(closing):
+                end, closing = token.end(), "".join(reversed(open_ones))
+    return text[:end] + closing
 
 
 def is_keypoint_table(path: Path) -> bool:
@@ -85,11 +130,17 @@ def _place(head: list[str], names: tuple[str, ...]) -> int | None:
 def _wide(rows: Iterator[list[str]]) -> Iterator[Frame]:
     head = next(rows)
     columns, frame, who = _columns(head), _place(head, _FRAME), _place(head, _WHO)
+    times = {
+        name.lower(): i for i, name in enumerate(head) if re.fullmatch(r"(time|timestamp|t)(_[mun]?s)?", name, re.I)
+    }
     for number, row in enumerate(rows):
         cells = [*row, *[""] * (len(head) - len(row))]
         points = [{"name": name, **{axis: cells[i] for axis, i in of.items()}} for name, of in columns.items()]
         person = {} if who is None or not cells[who] else {"person_id": cells[who]}
-        yield {"frame_id": number if frame is None else cells[frame], "people": [{**person, "keypoints": points}]}
+        at = {name: cells[i] for name, i in times.items()}
+        yield {
+            "frame_id": number if frame is None else cells[frame], **at, "people": [{**person, "keypoints": points}]
+        }  # fmt: skip
 
 
 def _long(rows: Iterator[list[str]]) -> Iterator[Frame]:

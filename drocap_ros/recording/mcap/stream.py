@@ -117,11 +117,13 @@ class McapStream:
 
     profile : of the header, once messages are read: "ros2", "ros1" or another
     resync : after damage, search the next whole chunk instead of ending there
+    trusting : only there, and take declarations of channels as they come: no file is read twice that is whole
     damage : parts that could not be read so far
     """
 
     path: Path
     resync: bool = False
+    trusting: bool = False
     damage: list[Damage] = field(default_factory=list)
     profile: str = "ros2"
     _whole_until: int = 0
@@ -132,8 +134,8 @@ class McapStream:
         from mcap.records import Channel, Header, Message, Metadata, Schema
 
         schemas: dict[int, Schema] = {}
-        channels = self._declared() if self.resync else {}
-        lost, searched = 0, self.resync
+        searched = self.resync and not self.trusting
+        channels, lost = self._declared() if searched else {}, 0
         for record in self._records():
             if isinstance(record, Schema):
                 schemas.setdefault(record.id, record)
@@ -236,7 +238,8 @@ class McapStream:
                     else:
                         yield record
                     # A wrong length swallows the chunks behind it.
-                    if self.resync and not whole and (place := _next_chunk(file, start + 1, end)) is not None:
+                    suspicious = not whole and (isinstance(record, Chunk) or not self.trusting)
+                    if self.resync and suspicious and (place := _next_chunk(file, start + 1, end)) is not None:
                         break
                     file.seek(end)
                 else:

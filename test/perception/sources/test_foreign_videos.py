@@ -314,6 +314,21 @@ def test_damaged_heads_end_in_one_line(tmp_path):
             assert "\n" not in str(error)  # noqa: PT017
 
 
+@pytest.mark.parametrize(("rate", "said"), [("240.000000", True), ("120", True), ("30.0", False), ("x", False)])
+def test_a_capture_rate_above_the_videos_is_slow_motion(tmp_path, caplog, rate, said):
+    path = tmp_path / "slow.mp4"
+    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as output:
+        output.metadata["com.android.capture.fps"] = rate
+        stream = output.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for i in range(8):
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64, 3), 9 * i, np.uint8), "bgr24")))
+        output.mux(stream.encode())
+    with open_source(path) as source:
+        assert len(list(source)) == 8
+    assert f"--rate {float(rate):g} gives the true times" in caplog.text if said else "slow motion" not in caplog.text
+
+
 @pytest.mark.parametrize("container", ["mp4", "mkv", "mov", "avi", "ts"])
 @pytest.mark.parametrize("sizes", [[(64, 48), (128, 96)], [(128, 96), (64, 48)], [(64, 48), (64, 64), (32, 32)]])
 def test_one_of_several_tracks_is_named_and_another_chosen(tmp_path, caplog, container, sizes):

@@ -246,6 +246,76 @@ def test_files_without_a_person_are_refused_in_one_line(tmp_path, capsys, name, 
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def json_lines(folder, k, far):
+    return text(
+        folder / "lines.jsonl", "\n".join(json.dumps({"frame": i, "keypoints": rows(p)}) for i, p in enumerate(k))
+    )
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6, 0.9])
+@pytest.mark.parametrize("form", [alphapose, cmu_form, mmpose, named_points, json_lines])
+def test_a_file_that_is_cut_off_gives_what_is_whole(tmp_path, form, share, caplog):
+    path = form(tmp_path, walk(30), walk(30) * 0.5)
+    whole = read_keypoints(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    cut = read_keypoints(path)
+    assert 0.5 * share * 30 < len(cut) < 30
+    assert np.allclose(cut.keypoints, whole.keypoints[: len(cut)], equal_nan=True)
+    assert "damaged in 1 places" in caplog.text
+
+
+@pytest.mark.parametrize(("key", "factor"), [
+    ("timestamp_ms", 1e3), ("timestamp", 1), ("time", 1e3), ("time_s", 1), ("timestamp", 1e6), ("timestamp", 1e9),
+    ("timestamp_us", 1e6),
+])  # fmt: skip
+@pytest.mark.parametrize("rate_hz", [12.5, 29.97, 120.0])
+def test_times_of_frames_are_the_rate(tmp_path, key, factor, rate_hz, caplog):
+    at = [1_700_000.0 + i / rate_hz for i in range(20)]
+    k = walk(20)
+    nodes = [{"frame": 10 + i, key: factor * t, "keypoints": rows(k[i])} for i, t in enumerate(at)]
+    found = read_keypoints(write(tmp_path / "k.json", nodes))
+    assert np.median(np.diff(found.stamp_ns)) == pytest.approx(1e9 / rate_hz, rel=1e-3)
+    assert "images per second" not in caplog.text
+    head = ["frame", key] + [f"{n}_{a}" for n in COCO_17.joints for a in ("x", "y")]
+    body = [[i, factor * t, *flat(k[i, :, :2])] for i, t in enumerate(at)]
+    found = read_keypoints(text(tmp_path / "k.csv", "\n".join(",".join(map(str, row)) for row in [head, *body])))
+    assert np.median(np.diff(found.stamp_ns)) == pytest.approx(1e9 / rate_hz, rel=1e-3)
+
+
+@pytest.mark.parametrize("form", [alphapose, several_animals, sleap])
+def test_another_person_of_a_file_is_chosen_by_number(tmp_path, form, caplog):
+    k, far = walk(), walk() * [0.3, 0.3, 1.0] + [100, 100, 0]
+    path = form(tmp_path, k, far)
+    first, second = (read_keypoints(path, Stated(15.0, SIZE, None, n)) for n in (None, 2))
+    assert "--subject N is another" in caplog.text
+    assert np.nanmedian(first.keypoints[5]) != np.nanmedian(second.keypoints[5])
+    assert np.allclose(second.keypoints[-1], far[-1, :, :2], atol=0.01)
+    with pytest.raises(InputError, match="--subject 3: expected a person of the file, 1 to 2"):
+        read_keypoints(path, Stated(15.0, SIZE, None, 3))
+    words = ["--subject", "2", "--image-size", "1280x720", "--rate", "15", "--method", "initial", "--no-report"]
+    assert main(["reconstruct", str(path), "--out", str(tmp_path / "out"), *words]) == 0
+    assert np.nanmax(load_tracks(tmp_path / "out" / "tracks.npz").keypoints) < 400
+
+
+def test_damaged_frames_are_gaps(tmp_path, caplog):
+    folder = openpose(tmp_path, walk(20), walk(20) * 0.5)
+    for i in (3, 9):
+        (folder / f"walk_{i:012d}_keypoints.json").write_text('{"people": [{"pose_keyp')
+    (folder / "._walk_000000000001_keypoints.json").write_bytes(bytes(90))
+    found = read_keypoints(folder)
+    assert len(found) == 20
+    assert np.flatnonzero(np.isnan(found.keypoints).all(axis=(1, 2))).tolist() == [3, 9]
+    path = json_lines(tmp_path, walk(20), None)
+    lines = path.read_text().splitlines()
+    lines[5] = lines[5][:40]
+    path.write_text("\n".join(lines))
+    found = read_keypoints(path)
+    assert len(found) == 20
+    assert np.isnan(found.keypoints[5]).all()
+    assert np.isfinite(found.keypoints[6:]).all()
+
+
 def test_damaged_files_give_tracks_or_one_clear_line(tmp_path):
     rng, k = random.Random(5), walk(4)
     whole = [form(tmp_path, k, k) for form in (alphapose, mmpose, coco, named_points, deeplabcut, with_scores)]

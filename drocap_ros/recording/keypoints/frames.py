@@ -1,0 +1,76 @@
+"""Frames and persons of a file of keypoints: whose points are whose, in which frames, and how many a second."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+
+#: A frame's name or number, or a person's; None = not stated.
+Label = str | int | float | None
+#: Digits of a frame's number; longer ones are times or sums.
+_LONGEST_NUMBER = 10
+#: Seconds of a unit by the end of a time's name; without one the first that gives a video's rate.
+_UNITS = {"_s": 1.0, "_ms": 1e-3, "_us": 1e-6, "_ns": 1e-9}
+_RATES_HZ = (2.0, 1000.0)
+
+
+def one_person(
+    people: list[tuple[int, Label, np.ndarray]], subject: int | None = None
+) -> tuple[dict[int, np.ndarray], str]:
+    """Points by frame of the person with most frames by its number, or of the ``subject``th; words on others.
+
+    Of several with one number, or without, the largest, then the nearest to it.
+    """
+    counted = Counter(who for _, who, _ in people).most_common()
+    several = len({frame for frame, _, _ in people}) < len(people) or len(counted) > 1
+    if subject is not None and not 1 <= subject <= len(counted):
+        raise InputError(f"--subject {subject}: expected a person of the file, 1 to {len(counted)}; choose another")
+    most = counted[(subject or 1) - 1][0]
+    named = ", ".join(f"{i} ({'person' if who is None else who}: {n} frames)" for i, (who, n) in enumerate(counted, 1))
+    words = f"several persons, {named}: {subject or 1} is reconstructed, --subject N is another" if several else ""
+    if several and len(counted) == 1:
+        words = "several persons without numbers: the largest is reconstructed, and the nearest to it"
+    by_frame: dict[int, list[np.ndarray]] = {}
+    for frame, who, points in people:
+        if who == most:
+            by_frame.setdefault(frame, []).append(points)
+    chosen: dict[int, np.ndarray] = {}
+    last: np.ndarray | None = None
+    for frame in sorted(by_frame):
+        sizes = [-np.ptp(p[np.isfinite(p[:, 0]), :2], axis=0).sum() for p in by_frame[frame]]
+        steps = sizes if last is None else [np.nanmedian(np.abs(p - last)[:, :2]) for p in by_frame[frame]]
+        last = chosen[frame] = by_frame[frame][int(np.argmin(np.nan_to_num(steps, nan=np.inf)))]
+    return chosen, words
+
+
+def natural(label: Label) -> list[tuple[int, str]]:
+    """Sort key that puts frame_2 before frame_10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(label)) if part]
+
+
+def numbers_of(labels: list[Label]) -> dict[Label, int]:
+    """Number of each frame: the last one in its name where that tells frames apart, else its place."""
+    names = list(dict.fromkeys(labels))
+    found = [re.findall(r"\d+", Path(n).stem if isinstance(n, str) else str(n))[-1:] for n in names]
+    numbers = [int(digits[0]) for digits in found if digits and len(digits[0]) < _LONGEST_NUMBER]
+    return dict(zip(names, numbers if len(set(numbers)) == len(names) else range(len(names)), strict=True))
+
+
+def rate_of_times(times: Mapping[Label, tuple[str, float]]) -> float | None:
+    """Images per second by the times of frames, each with its key; None where they are of no video."""
+    numbers = numbers_of(list(times))
+    rows = sorted((numbers[frame], time) for frame, (_, time) in times.items())
+    if len(rows) < 2:
+        return None
+    count, seconds = np.diff(np.array(rows, np.float64), axis=0).T
+    key = next(iter(times.values()))[0]
+    units = [factor for end, factor in _UNITS.items() if key.endswith(end)] or list(_UNITS.values())
+    step = float(np.median(seconds / np.maximum(count, 1)))
+    rates = [1 / (step * unit) for unit in units] if step > 0 else []
+    return next((rate for rate in rates if _RATES_HZ[0] <= rate <= _RATES_HZ[1]), None)
