@@ -17,7 +17,7 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "export",
         run,
-        help="write a motion as BVH, C3D, TRC, CSV or glTF, or its joint angles",
+        help="write a motion as BVH, USD, FBX, glTF, C3D, TRC or CSV, or its joint angles",
         description=f"Write a motion in the format of another tool. {units}. Conventions: docs/export.md.",
     )
     add_motion_argument(parser)
@@ -26,9 +26,9 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--names",
         choices=("h36m", "lafan1", "mixamo", "mixamo-three"),
-        help="joint names of bvh and glb; mixamo-three: Mixamo's as three.js has them (default: h36m)",
+        help="joint names of bvh, glb, usd and fbx; mixamo-three: Mixamo's as three.js has them (default: h36m)",
     )
-    parser.add_argument("--rest", choices=("t", "a"), help="rest pose of bvh and glb: T or A (default: t)")
+    parser.add_argument("--rest", choices=("t", "a"), help="rest pose of bvh, glb, usd and fbx: T or A (default: t)")
     parser.add_argument(
         "--smooth",
         metavar="HZ",

@@ -1,7 +1,8 @@
-"""Motions in the formats of other tools: BVH, C3D, TRC, CSV, glTF, joint angles, OpenSim (``docs/export.md``)."""
+"""Motions in the formats of other tools (docs/export.md): BVH, C3D, TRC, CSV, glTF, USD, FBX, angles, OpenSim."""
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -22,9 +23,11 @@ FORMATS = {
     "csv-angles": "joint angles, degrees",
     "glb": "metres, y up",
     "mot": "OpenSim coordinates, degrees and metres, y up",
+    "usd": "metres, y up",
+    "fbx": "metres, by Blender",
 }
 #: Formats with an animation skeleton: names of its joints and its rest pose can be chosen.
-RIGGED = ("bvh", "glb")
+RIGGED = ("bvh", "glb", "usd", "fbx")
 #: Formats of measured positions; the others need a pose in each frame.
 MEASURED = ("c3d", "trc", "csv")
 
@@ -42,8 +45,8 @@ def export(
     """Write a motion, or the motion of a file or folder, to a file of another format.
 
     form : one of :data:`FORMATS`; None: the ending of ``path``
-    names : joint names of BVH and glTF, one of :data:`drocap_ros.export.rig.NAMES`; None: "h36m"
-    rest : rest pose of BVH and glTF, one of :data:`drocap_ros.export.rig.RESTS`; None: "t"
+    names : joint names of rigs, one of :data:`drocap_ros.export.rig.NAMES`; None: "h36m"
+    rest : rest pose of rigs, one of :data:`drocap_ros.export.rig.RESTS`; None: "t"
     smooth_hz : cut-off of :func:`drocap_ros.export.take.smooth`; None: no filter
     lock_feet : :func:`drocap_ros.export.take.lock_feet`, after the filter
 
@@ -56,8 +59,10 @@ def export(
     from drocap_ros.export.animation import write_bvh, write_glb
     from drocap_ros.export.measured import write_c3d, write_csv, write_csv_angles, write_trc
     from drocap_ros.export.opensim import write_mot
+    from drocap_ros.export.usd import write_fbx, write_usd
     from drocap_ros.motion import Motion, load_motion
 
+    whole = motion if isinstance(motion, Motion) else load_motion(motion)
     writers: dict[str, Callable[..., tuple[str, ...]]] = {
         "bvh": write_bvh,
         "c3d": write_c3d,
@@ -66,6 +71,8 @@ def export(
         "csv-angles": write_csv_angles,
         "glb": write_glb,
         "mot": write_mot,
+        "usd": functools.partial(write_usd, motion=whole),
+        "fbx": write_fbx,
     }
     form = form or Path(path).suffix[1:]
     if form not in writers:
@@ -73,7 +80,6 @@ def export(
     chosen = {name: value for name, value in (("names", names), ("rest", rest)) if value is not None}
     if chosen and form not in RIGGED:
         raise InputError(f"{', '.join(chosen)}: expected with format {' or '.join(RIGGED)}, got {form}; leave it out")
-    whole = motion if isinstance(motion, Motion) else load_motion(motion)
     take = preparation.take_of(whole, measured=form in MEASURED)
     if smooth_hz is not None:
         take = preparation.smooth(take, smooth_hz)

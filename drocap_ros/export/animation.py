@@ -162,8 +162,8 @@ def _joint_nodes(rig: Rig) -> list[Json]:
     return nodes
 
 
-def _bones(buffer: _Buffer, rig: Rig) -> Json:
-    """Octahedra from each joint to its children or its bone's end; without normals viewers shade them flat."""
+def octahedra(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """From each joint to its children or its bone's end: corners (N, 3) m at rest, faces (K, 3), joints (N,)."""
     tips = [(parent, rig.rest[child]) for child, parent in enumerate(rig.parents) if parent >= 0]
     tips += [(joint, rig.rest[joint] + end) for joint, end in rig.ends.items()]
     owner = np.array([joint for joint, _ in tips])
@@ -175,21 +175,28 @@ def _bones(buffer: _Buffer, rig: Rig) -> Json:
     ring = _GIRTH * along[:, None] + np.stack([aside[:, 0], aside[:, 1], -aside[:, 0], -aside[:, 1]], axis=1)
     corners = np.concatenate([np.zeros_like(ring[:, :1]), ring, along[:, None]], axis=1) + rig.rest[owner][:, None]
     faces = np.array([face for i in range(4) for face in ((0, 1 + (i + 1) % 4, 1 + i), (5, 1 + i, 1 + (i + 1) % 4))])
-    joints = np.zeros((len(tips) * 6, 4), np.uint8)
-    joints[:, 0] = np.repeat(owner, 6)
+    triangles = 6 * np.arange(len(tips))[:, None, None] + faces
+    return corners.reshape(-1, 3), triangles.reshape(-1, 3), np.repeat(owner, 6)
+
+
+def _bones(buffer: _Buffer, rig: Rig) -> Json:
+    """The mesh; without normals viewers shade it flat."""
+    corners, triangles, owner = octahedra(rig)
+    joints = np.zeros((len(owner), 4), np.uint8)
+    joints[:, 0] = owner
     attributes = {
-        "POSITION": buffer.add(corners.reshape(-1, 3).astype(np.float32), bounds=True, target=_ARRAY_BUFFER),
+        "POSITION": buffer.add(corners.astype(np.float32), bounds=True, target=_ARRAY_BUFFER),
         "JOINTS_0": buffer.add(joints, target=_ARRAY_BUFFER),
         "WEIGHTS_0": buffer.add(np.tile(np.eye(4, dtype=np.float32)[0], (len(joints), 1)), target=_ARRAY_BUFFER),
     }
-    triangles = (6 * np.arange(len(tips))[:, None, None] + faces).astype(np.uint16)
-    return {"attributes": attributes, "indices": buffer.add(triangles.reshape(-1), target=_ELEMENT_BUFFER)}
+    indices = triangles.astype(np.uint16).reshape(-1)
+    return {"attributes": attributes, "indices": buffer.add(indices, target=_ELEMENT_BUFFER)}
 
 
 def _animation(buffer: _Buffer, rig: Rig, times_s: np.ndarray) -> Json:
     times = buffer.add(times_s.astype(np.float32), bounds=True)
     tracks = [(0, "translation", rig.root)]
-    tracks += [(joint, "rotation", _continuous(rig.local(joint).as_quat())) for joint in range(len(rig.names))]
+    tracks += [(joint, "rotation", continuous(rig.local(joint).as_quat())) for joint in range(len(rig.names))]
     samplers: list[Json] = []
     channels: list[Json] = []
     for node, kind, values in tracks:
@@ -199,7 +206,7 @@ def _animation(buffer: _Buffer, rig: Rig, times_s: np.ndarray) -> Json:
     return {"name": "motion", "samplers": samplers, "channels": channels}
 
 
-def _continuous(quaternions: np.ndarray) -> np.ndarray:
+def continuous(quaternions: np.ndarray) -> np.ndarray:
     """The same rotations (F, 4), each with the sign nearer to the previous frame."""
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     signs = np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))

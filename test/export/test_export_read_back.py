@@ -9,7 +9,7 @@ from export_readers import READERS, gltf_array
 from drocap_ros.export import RIGGED, export
 from drocap_ros.skeleton import BODY_15
 
-TOLERANCE_M = {"bvh": 0.005, "c3d": 0.001, "trc": 0.001, "csv": 0.001, "glb": 0.001}
+TOLERANCE_M = {"bvh": 0.005, "c3d": 0.001, "trc": 0.001, "csv": 0.001, "glb": 0.001, "usd": 0.001}
 
 
 def written(motion, form, folder):
@@ -59,7 +59,7 @@ def test_gaps_are_kept_by_formats_with_missing_values(with_gaps, tmp_path, form)
     assert worst(back, with_gaps.joints3d) < 0.001
 
 
-@pytest.mark.parametrize("form", ["bvh", "glb"])
+@pytest.mark.parametrize("form", ["bvh", "glb", "usd"])
 def test_gaps_are_interpolated_in_formats_without_missing_values(walker, with_gaps, tmp_path, form):
     back, notes = written(with_gaps, form, tmp_path)
     off = in_order(back, form) - walker.joints3d
@@ -92,7 +92,7 @@ def test_uneven_stamps_are_kept_or_resampled(walker, tmp_path, form):
     expected = walker.joints3d[0] + (np.arange(3)[None] * back.times_s[:, None])[:, None]
     assert worst(back, expected, form) < TOLERANCE_M[form]
     assert back.rate_hz == pytest.approx(25.0)
-    if form in ("csv", "glb"):
+    if form in ("csv", "glb", "usd"):
         np.testing.assert_allclose(back.times_s, stamps * 1e-9, atol=1e-6)
     else:
         np.testing.assert_allclose(back.times_s, np.arange(10) * 0.04, atol=1e-5)
@@ -138,7 +138,7 @@ def test_glb_has_a_closed_bone_from_each_joint_to_the_next(walker, tmp_path):
     np.testing.assert_allclose(volume, 2.0 / 3.0 * 0.1**2 * length**3, rtol=1e-3)
 
 
-@pytest.mark.parametrize("form", RIGGED)
+@pytest.mark.parametrize("form", [form for form in RIGGED if form in READERS])
 @pytest.mark.parametrize("rest", ["t", "a"])
 @pytest.mark.parametrize("names", ["lafan1", "mixamo", "mixamo-three"])
 def test_rigs_have_the_names_of_other_programs(walker, tmp_path, form, names, rest):
@@ -149,6 +149,7 @@ def test_rigs_have_the_names_of_other_programs(walker, tmp_path, form, names, re
         "mixamo": ("mixamorig:", "ToeBase"),
         "mixamo-three": ("mixamorig", "ToeBase"),
     }[names]
+    prefix = prefix.replace(":", "_") if form == "usd" else prefix  # a colon ends a namespace there
     expected = {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"} | {
         side + name
         for side in ("Left", "Right")

@@ -113,4 +113,20 @@ def gltf_array(document, number: int) -> np.ndarray:
     return np.frombuffer(blob, kind).reshape(accessor.count, width).astype(float)
 
 
-READERS = {"bvh": read_bvh, "c3d": read_c3d, "trc": read_trc, "csv": read_csv, "glb": read_glb}
+def read_usd(path: Path) -> ReadBack:
+    """Joints as UsdSkel itself computes them."""
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    stage = Usd.Stage.Open(str(path))
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
+    cache, rate = UsdSkel.Cache(), stage.GetTimeCodesPerSecond()
+    root = UsdSkel.Root(stage.GetPrimAtPath("/Motion/Person"))
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    query = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Motion/Person/Skeleton")))
+    codes = query.GetAnimQuery().GetJointTransformTimeSamples()
+    positions = [[m.ExtractTranslation() for m in query.ComputeJointSkelTransforms(code)] for code in codes]
+    names = tuple(str(path).rsplit("/", 1)[-1] for path in query.GetJointOrder())
+    return ReadBack(names, z_up(np.array(positions)), rate, np.array(codes) / rate)
+
+
+READERS = {"bvh": read_bvh, "c3d": read_c3d, "trc": read_trc, "csv": read_csv, "glb": read_glb, "usd": read_usd}
