@@ -20,7 +20,14 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.recording.keypoints.frames import Label, natural, numbers_of, one_person, rate_of_times
+from drocap_ros.recording.keypoints.frames import (
+    Label,
+    natural,
+    numbers_of,
+    of_one_recording,
+    one_person,
+    rate_of_times,
+)
 from drocap_ros.recording.keypoints.orders import counts, name_points
 from drocap_ros.recording.keypoints.tables import is_keypoint_table, read_json, read_table
 from drocap_ros.tracks import MAX_FRAMES, Tracks, kind_of, load_tracks, read_npz, save_tracks, without_unseen
@@ -251,8 +258,9 @@ _USUAL_HZ = 30.0
 #: Coordinates that are all within the first are shares of the picture.  Scores beyond the second are no shares of one:
 #: some networks exceed 1 a little, and COCO's flags end there.
 _LARGEST_SHARE, _HIGHEST_SCORE = 2.0, 2.0
-#: Share of coordinates below zero from which they are about a middle; persons at the edge have few.
-_MOST_BELOW = 0.1
+#: Share of coordinates below zero from which they are about a middle, where half are: of a person whose head is above
+#: the picture every sixth is.
+_MOST_BELOW = 0.3
 #: No network sees a person of fewer px.
 _SMALLEST_PX = 6.0
 #: Frames so many times as far apart as they are many are no video's.
@@ -403,7 +411,7 @@ def _series(path: Path, content: Content, subject: int | None) -> tuple[np.ndarr
         found = "3D poses; take the 2D keypoints of the pictures" if content.space else "none; check the file"
         raise InputError(f"expected 2D keypoints of a person, found {found}")
     count = counted.most_common(1)[0][0]
-    frames, people = _by_time(content, count)
+    frames, people = _by_time(path, content, count)
     chosen, words = one_person(people, subject)
     if words:
         logger.warning("%s: %s", path, words)
@@ -411,11 +419,14 @@ def _series(path: Path, content: Content, subject: int | None) -> tuple[np.ndarr
     return frames, np.stack([chosen.get(frame, missing) for frame in frames.tolist()])
 
 
-def _by_time(content: Content, count: int) -> tuple[np.ndarray, list[tuple[int, Label, np.ndarray]]]:
+def _by_time(path: Path, content: Content, count: int) -> tuple[np.ndarray, list[tuple[int, Label, np.ndarray]]]:
     """Numbers (F,) of the frames, gaps filled up, and the persons of ``count`` points by these numbers."""
     labels = {frame: content.pictures.get(frame, frame) for frame in content.frames}
-    numbers = numbers_of(sorted(labels.values(), key=natural) if content.pictures else content.frames)
-    people = [(numbers[labels[frame]], who, p) for frame, who, p in content.people if len(p) == count]
+    kept, words = of_one_recording(list(labels.values()))
+    if words:
+        logger.warning("%s: %s", path, words)
+    numbers = numbers_of(sorted(kept, key=natural) if content.pictures else kept)
+    people = [(numbers[labels[f]], who, p) for f, who, p in content.people if len(p) == count and labels[f] in numbers]
     frames = np.unique(list(numbers.values()))
     step = np.gcd.reduce(np.diff(frames)) if len(frames) > 1 else 1
     if (frames[-1] - frames[0]) // step < min(_SPARSE * len(frames), MAX_FRAMES):

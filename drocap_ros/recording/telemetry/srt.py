@@ -31,8 +31,10 @@ from drocap_ros.recording.telemetry.log import (
 from drocap_ros.recording.telemetry.video_tracks import find_track, read_samples
 from drocap_ros.tracks import MAX_FRAMES
 
-#: Formats of a video's subtitle tracks (3GPP TS 26.245, QuickTime).
-TEXT_TRACKS = ("tx3g", "text")
+#: Formats of a video's subtitle tracks: of MP4 (3GPP TS 26.245, QuickTime), whose texts begin with their length, and by
+#: their codecs of other containers.
+_WITH_LENGTH = ("tx3g", "text")
+TEXT_TRACKS = (*_WITH_LENGTH, "subrip", "srt", "webvtt")
 #: Characters of a line, and of a subtitle; more are cut off.  DJI's have some hundreds.
 _LINE = 8192
 #: Sources of a height, the preferred one first.
@@ -146,10 +148,11 @@ def _geodetic(places: np.ndarray) -> np.ndarray:
 
 
 def _inside(path: Path) -> Iterator[tuple[int, str]]:
-    """Time ns and text of each sample of a video's subtitle track: two bytes of length, then the text."""
+    """Time ns and text of each sample of a video's subtitle track."""
     if found := find_track(path, TEXT_TRACKS):
         for stamp_ns, data in read_samples(path, found[0]):
-            yield stamp_ns, data[2 : 2 + int.from_bytes(data[:2], "big")][:_LINE].decode("utf-8", errors="replace")
+            text = data[2 : 2 + int.from_bytes(data[:2], "big")] if found[1] in _WITH_LENGTH else data
+            yield stamp_ns, text[:_LINE].decode("utf-8", errors="replace")
 
 
 def _subtitles(path: Path) -> Iterator[tuple[int, str]]:

@@ -18,8 +18,15 @@ _MAX_DURATION_S = 1e6  # s: eleven days
 
 def find_track(path: Path, codes: Sequence[str]) -> tuple[int, str] | None:
     """Number and format of the track whose format comes first in ``codes``, None where there is none."""
-    there = track_codes(path)
+    there = track_codes(path) or _codecs(path)
     return next(((there.index(code), code) for code in codes if code in there), None)
+
+
+def _codecs(path: Path) -> list[str]:
+    """Names of the codecs of the tracks of another container, empty where FFmpeg opens none."""
+    with contextlib.suppress(pyav().error.FFmpegError), open_container(path) as container:
+        return [stream.codec_context.name if stream.codec_context else "" for stream in container.streams]
+    return []
 
 
 def read_samples(path: Path, number: int) -> Iterator[tuple[int, bytes]]:

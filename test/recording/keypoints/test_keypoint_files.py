@@ -298,6 +298,26 @@ def test_another_person_of_a_file_is_chosen_by_number(tmp_path, form, caplog):
     assert np.nanmax(load_tracks(tmp_path / "out" / "tracks.npz").keypoints) < 400
 
 
+@pytest.mark.parametrize("names", ["{}/{:06d}.jpg", "{}_{:04d}.png", "take{}-{}"])
+def test_one_of_several_recordings_in_a_file_is_named(tmp_path, names, caplog):
+    takes = (("1", walk(8)), ("2", walk(12) + np.array([50, 0, 0])))
+    nodes = [{"image_id": names.format(of, i), "keypoints": flat(p)} for of, k in takes for i, p in enumerate(k)]
+    found = read_keypoints(write(tmp_path / "k.json", nodes))
+    assert len(found) == 12
+    assert np.allclose(found.keypoints, walk(12)[..., :2] + [50, 0], atol=0.01)
+    assert "several recordings" in caplog.text
+    dated = [{"image_id": f"2024-05-01_10-00-{i // 6:02d}_{i % 6}.jpg", "keypoints": flat(p)}
+             for i, p in enumerate(walk(18))]  # fmt: skip
+    assert len(read_keypoints(write(tmp_path / "d.json", dated))) == 18
+
+
+def test_a_head_above_the_picture_is_no_middle(tmp_path):
+    k = walk()
+    k[..., 1] -= 290  # of an ordinary person, whose head is cut off
+    np.save(tmp_path / "k.npy", k)
+    assert len(read_keypoints(tmp_path / "k.npy", Stated(15.0, SIZE))) == 12
+
+
 def test_damaged_frames_are_gaps(tmp_path, caplog):
     folder = openpose(tmp_path, walk(20), walk(20) * 0.5)
     for i in (3, 9):

@@ -18,7 +18,7 @@ from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.recording.telemetry.log import Lack, LogLack, camera_attitude, camera_poses
 from drocap_ros.recording.telemetry.read import read_telemetry
-from drocap_ros.recording.video_telemetry import find_offset
+from drocap_ros.recording.video_telemetry import find_offset, read_own
 
 
 def test_tlog_states_equal_what_pymavlink_reads(shared):
@@ -205,6 +205,29 @@ def test_subtitles_inside_a_video_are_read_as_those_beside_it(tmp_path, invented
     assert np.array_equal(inside.track.gimbal, beside.track.gimbal)
     assert main(["info", str(tmp_path / "s.mp4")]) == 0
     assert "source: DJI subtitles" in capsys.readouterr().out
+
+
+def test_subtitles_inside_matroska_are_read_too(tmp_path, invented_flight):
+    import av
+
+    _, _, geodetic, mount = invented_flight
+    lines = [dji_subtitle(i, g, m) for i, (g, m) in enumerate(zip(geodetic, mount, strict=True))]
+    (tmp_path / "x.srt").write_text(srt_text(np.arange(len(lines)) * 0.1, lines))
+    video = plain_video(tmp_path / "v.mp4", 10)
+    with (
+        av.open(str(video)) as pictures,
+        av.open(str(tmp_path / "x.srt")) as texts,
+        av.open(str(tmp_path / "s.mkv"), "w") as output,
+    ):
+        streams = {s: output.add_stream_from_template(s) for s in (pictures.streams.video[0], texts.streams[0])}
+        for source in (pictures, texts):
+            for packet in source.demux():
+                if packet.dts is not None:
+                    packet.stream = streams[packet.stream]
+                    output.mux(packet)
+    inside, beside = read_telemetry(tmp_path / "x.srt"), read_own(tmp_path / "s.mkv")[0][1]
+    assert np.allclose(inside.track.gimbal, beside.track.gimbal)
+    assert np.abs(inside.track.stamp_ns - beside.track.stamp_ns).max() < 2_000_000
 
 
 @pytest.mark.parametrize(("slow", "said"), [(4, True), (1, False)])
