@@ -18,7 +18,6 @@ from drocap_ros.export.rig import Rig, rig_of
 from drocap_ros.export.rigid_body import BODY
 from drocap_ros.export.take import Take, at_constant_rate, y_up
 
-_CM = 100.0  # in a metre
 _FORMAT = "%.5f"
 
 
@@ -32,7 +31,7 @@ def write_bvh(path: Path, take: Take, *, names: str = "h36m", rest: str = "t") -
     rig, notes = rig_of(take, names=names, rest=rest)
     lines: list[str] = ["HIERARCHY"]
     # The root rests where its channels put it, so that a viewer without channels shows a standing person.
-    columns = [_CM * rig.root]
+    columns = [100.0 * rig.root]
     _joint(lines, columns, rig, 0, 0)
     values = np.concatenate(columns, axis=1)
     with path.open("w", encoding="ascii", newline="\n") as out:
@@ -71,7 +70,7 @@ def _channels(rotations: np.ndarray) -> np.ndarray:
 
 
 def _numbers(metres: np.ndarray) -> str:
-    return " ".join(_FORMAT % v for v in _CM * metres + 0.0)
+    return " ".join(_FORMAT % v for v in 100.0 * metres + 0.0)
 
 
 #: An object of glTF's JSON.

@@ -26,7 +26,6 @@ from drocap_ros.export.take import Take, at_constant_rate, y_up
 from drocap_ros.geometry.alignment import directions
 from drocap_ros.skeleton import TOES
 
-_MM = 1000.0  # in a metre
 #: The format counts frames in 16 bits; readers differ in longer files.
 _MAX_C3D_FRAMES = 65_535
 #: Rows of a CSV file formatted at a time, to bound the memory.
@@ -46,7 +45,7 @@ def write_c3d(path: Path, take: Take) -> tuple[str, ...]:
     known = np.isfinite(take.positions).all(axis=2)
     # Columns of a point: x, y, z, residual (0 = no estimate of the error, -1 = not measured), camera mask.
     points = np.zeros((frames, joints, 5), np.float32)
-    points[..., :3] = np.where(known[..., None], _MM * take.positions, 0.0)
+    points[..., :3] = np.where(known[..., None], 1000.0 * take.positions, 0.0)
     points[..., 3] = np.where(known, 0.0, -1.0)
     writer = c3d.Writer(point_rate=take.rate_hz, point_units="mm")
     writer.set_point_labels(take.joints)
@@ -75,7 +74,7 @@ def write_trc(path: Path, take: Take) -> tuple[str, ...]:
     )
     # Times are multiples of the stated rate: readers check one against the other.
     numbers = np.arange(frames)
-    table = np.column_stack([numbers + 1, numbers / take.rate_hz, _MM * take.positions.reshape(frames, -1)])
+    table = np.column_stack([numbers + 1, numbers / take.rate_hz, 1000.0 * take.positions.reshape(frames, -1)])
     with path.open("w", encoding="utf-8", newline="\n") as out:
         out.write(header)
         np.savetxt(out, table, fmt=["%d", "%.6f", *["%.4f"] * (3 * joints)], delimiter="\t")

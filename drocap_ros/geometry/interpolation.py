@@ -8,7 +8,6 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, slerp
 
-_NS = 1e-9  # s
 #: Longest time between two states over which values are interpolated.
 MAX_GAP_S = 2.0
 #: Time beyond the first and last state for which these still hold; at 25 deg/s it is 2.5 deg.
@@ -71,8 +70,8 @@ def interpolate(
     inside = np.clip(stamp_ns, known_ns[0], known_ns[-1])
     span = known_ns[after] - known_ns[before]
     between = (inside == stamp_ns) & (stamp_ns != known_ns[before]) & (stamp_ns != known_ns[after])
-    gap_s = np.where(between, span, 0) * _NS
-    outside_s = np.abs(inside - stamp_ns) * _NS
+    gap_s = np.where(between, span, 0) * 1e-9
+    outside_s = np.abs(inside - stamp_ns) * 1e-9
     part = np.where(span > 0, (inside - known_ns[before]) / np.maximum(span, 1), 0.0)
     if spherical:
         found = slerp(values[before], values[after], part)

@@ -11,11 +11,10 @@ import numpy as np
 from drocap_ros.clip import Progress
 from drocap_ros.motion import FILE, Motion
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
+from drocap_ros.report.statistics import SMOOTH_S
 
 #: Time (s) from the last image that shows a person, or to the next one, over which the pose is drawn.
 _UNSEEN_S = 0.5
-#: Time (s) over which the place of a person without a world is averaged.
-_STEADY_S = 0.5
 
 
 def people_files(folder: Path) -> dict[int, Path]:
@@ -84,7 +83,7 @@ def _places(motion: Motion) -> np.ndarray:
     at = np.arange(len(seen))
     filled = np.stack([np.interp(at, known, places[known, axis]) for axis in range(3)], axis=1)
     step_s = float(np.median(np.diff(motion.stamp_ns))) * 1e-9 if len(seen) > 1 else 1.0
-    return np.asarray(gaussian_filter1d(filled, _STEADY_S / step_s, axis=0, mode="nearest"))
+    return np.asarray(gaussian_filter1d(filled, SMOOTH_S / step_s, axis=0, mode="nearest"))
 
 
 def save_people_report(

@@ -14,8 +14,8 @@ from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
 from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
 
-#: Directions of view and of the body are averaged over this time, s.
-_SMOOTH_S = 0.5
+#: Directions of view and of the body, and places without a world, are averaged over this time, s.
+SMOOTH_S = 0.5
 #: A knee counts as bent from this angle, degrees, on; below it the direction of the bend is noise.
 _BENT_DEG = 25.0
 #: Spread of the camera's bearings (mean square about the mean of unit vectors) of half a turn: 0.6; of a whole one: 1.
@@ -156,10 +156,10 @@ def mean_known(values: np.ndarray, axis: int | None) -> np.ndarray:
 
 
 def smooth(values: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Moving average over ``_SMOOTH_S`` along the first axis; shorter at the ends."""
+    """Moving average over ``SMOOTH_S`` along the first axis; shorter at the ends."""
     if len(values) < 2:
         return values
-    half = max(1, round(0.5 * _SMOOTH_S / float(np.median(np.diff(times_s)))))
+    half = max(1, round(0.5 * SMOOTH_S / float(np.median(np.diff(times_s)))))
     total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     at = np.arange(len(values))
     first, last = np.maximum(at - half, 0), np.minimum(at + half + 1, len(values))

@@ -145,8 +145,8 @@ _LIMBS = 0.08
 _LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn and stoop
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
 _LONG_AGO_NS = 10**18
-#: First, least and largest recent share of detections of a person.
-_FIRST_RATE_SEEN, _RATES = 0.5, (0.2, 0.9)
+#: First, least and largest recent share of detections of a person, and the weight of a new image in it.
+_FIRST_RATE_SEEN, _RATES, _SEEN_RATE = 0.5, (0.2, 0.9), 0.2
 
 
 class PoseBelief:
@@ -343,7 +343,7 @@ class Person:
 
     def searched(self, found: bool) -> None:
         """Count an image in which it was sought at its place."""
-        self.rate = float(np.clip(self.rate + _RECENT_RATE * (found - self.rate), *_RATES))
+        self.rate = float(np.clip(self.rate + _SEEN_RATE * (found - self.rate), *_RATES))
 
     def update(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
         """Update with a detection, not yet confirmed."""

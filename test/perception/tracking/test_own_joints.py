@@ -8,6 +8,8 @@ from people_scenes import PeopleScene, camera_of, people_of
 from drocap_ros.perception.pose.body_pose import BodyPose
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
 from drocap_ros.perception.tracking.own_joints import ExpectedJoints, Poses, own_joints
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.subject import SubjectTracker
 from drocap_ros.skeleton import BODY_15
 
 SCENE = PeopleScene("cross", 1)
@@ -88,3 +90,29 @@ def test_one_gap_is_as_long_as_many_images_without_the_person() -> None:
     left_out.predict(hidden.stamp_ns)
     apart = np.linalg.norm(left_out.xy - hidden.xy, axis=1)
     assert (apart < 0.15 * np.linalg.norm(hidden.xy - tracks_up_to(10, (0,))[0].xy, axis=1)).all()
+
+
+def test_who_is_behind_somebody_is_lost_when_that_one_has_moved_on() -> None:
+    tracker, image, score = (
+        SubjectTracker(PoseEstimatorConfig(subject="roi")),
+        np.zeros((720, 1280, 3), np.uint8),
+        [0.8],
+    )
+    box = ExpectedJoints(pose_of(TRUTH[0][0]), BODY_15, 0).box
+    right = np.array([1, 0, 1, 0])
+    tracker.update(image, 0, np.array([box, box + 400 * right]), np.array([0.8, 0.8]))
+    hidden = tracker.persons[1]
+    hidden.joints = ExpectedJoints(pose_of(TRUTH[0][0] + [10, 0]), BODY_15, 0)
+
+    def see(n: int, moved_px: float) -> None:
+        tracker.update(image, n * 200_000_000, box[None] + moved_px * right, np.array(score))
+
+    for n in range(1, 25):
+        see(n, 0.0)
+    assert hidden in tracker.persons
+    for n in range(25, 50):
+        see(n, 12.0 * (n - 24))
+    assert (hidden in tracker.persons, tracker.lost) == (False, [hidden])
+    for n in range(50, 130):
+        see(n, 300.0)
+    assert tracker.lost == []  # nobody is kept for longer than anyone is found again
