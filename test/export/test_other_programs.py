@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from drocap_ros.export.usd import lens_of
 from drocap_ros.motion import save_motion
 from drocap_ros.simulation.capture import simulate_capture
 
+ROOT = Path(__file__).parents[2]
 _BACK = """
 import sys
 import bpy
@@ -98,3 +101,29 @@ def test_blender_reads_its_own_file(filmed, tmp_path):
     hips = motion.joints3d[[0, 23]][:, [motion.joints.index(name) for name in ("pelvis", "lwrist")]]
     off = places - hips
     assert np.linalg.norm(off - off.mean(axis=(0, 1)), axis=-1).max() < 0.02
+
+
+def test_blender_opens_the_tutorial_s_file_without_settings(filmed, tmp_path):
+    if importlib.util.find_spec("bpy") is None and shutil.which("blender") is None:
+        pytest.skip("neither blender nor the package bpy is installed")
+    page = (ROOT / "docs" / "tutorial.md").read_text()
+    words = re.search(r"drocap (export walk .*)", page)[1].replace("walk.glb", str(tmp_path / "walk.glb")).split()
+    save_motion(tmp_path / "motion.npz", filmed[0])
+    assert main([str(tmp_path) if word == "walk" else word for word in words]) == 0
+    script = """
+import sys
+import bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.import_scene.gltf(filepath=sys.argv[-1])
+(rig,) = (thing for thing in bpy.data.objects if thing.type == "ARMATURE")
+heights = [(rig.matrix_world @ bone.head)[2] for bone in rig.pose.bones]
+print("found", min(heights), max(heights), "Hips" in rig.pose.bones)
+"""
+    command = [sys.executable, "-c", script]
+    if importlib.util.find_spec("bpy") is None:
+        command = ["blender", "--background", "--python-expr", script, "--"]
+    done = subprocess.run([*command, str(tmp_path / "walk.glb")], capture_output=True, text=True, check=True)
+    low, high, named = next(line for line in done.stdout.splitlines() if line.startswith("found")).split()[1:]
+    assert float(low) < 0.15
+    assert 1.4 < float(high) < 2.0
+    assert named == "True"

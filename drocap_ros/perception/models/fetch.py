@@ -51,7 +51,8 @@ def fetch_member(package: Package, member: str, target: Path) -> None:
         pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", "download", "--no-deps"]
         options = ["--only-binary", ":all:", "--require-hashes", "--dest", name, *package.tags, "-r", str(listed)]
         try:
-            done = subprocess.run([*pip, *options], capture_output=True, text=True, timeout=_PIP_TIMEOUT_S)
+            # Python finds modules in its folder first: a user's `random.py` is none of pip's.
+            done = subprocess.run([*pip, *options], capture_output=True, text=True, timeout=_PIP_TIMEOUT_S, cwd=name)
         except subprocess.TimeoutExpired:
             raise FetchError(
                 f"{package.pin}: no download in {_PIP_TIMEOUT_S} s; check the network, try again"
