@@ -77,6 +77,9 @@ def main(argv: Sequence[str] | None = None, parser: LineParser | None = None) ->
             return 0
         args = parser.parse_args(words)
         args.command_line = shlex.join(["drocap", *words])
+        # The networks' own words are no warning about an input.
+        words_of_networks = logging.ERROR if getattr(args, "quiet", False) else logging.NOTSET
+        logging.getLogger("drocap_ros.perception.estimator").setLevel(words_of_networks)
         with interruptible(getattr(args, "interrupted_by", BOTH)) as interrupted:
             status: int = args.run(args)
         sys.stdout.flush()

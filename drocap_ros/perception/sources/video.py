@@ -186,6 +186,9 @@ class VideoSource(ImageSource):
         rate = float(self._stream.guessed_rate or 0)
         self._rate_hz = rate if 0.1 < rate < 1000 else 30.0
         self._tell_slow_motion()
+        if chapters := _other_chapters(self.path):
+            names = f"{self.path.name} is one of {len(chapters) + 1} chapters"
+            log.warning("%s: %s: only this one is used; join them: ffmpeg -f concat", self.path, names)
         self._stated_s = stated_s(self._container, self._stream)
         self.length = self._stated_length()
         self.duration_s = (self.length - 1) / self._rate_hz if self.length else None
@@ -292,6 +295,19 @@ class VideoSource(ImageSource):
         """Close the file."""
         self._closed = True
         self._container.close()
+
+
+def _other_chapters(path: Path) -> list[Path]:
+    """The other files of a GoPro's recording: GX010012.MP4, GX020012.MP4, older ones GOPR0012.MP4, GP010012.MP4."""
+    found = re.fullmatch(r"(?:G[XHLP]\d\d|GOPR)(\d{4})", path.stem, re.IGNORECASE)
+    others = path.parent.glob(f"[Gg]*[0-9]{path.suffix}") if found else ()
+    same = re.compile(rf"(?:G[XHLP]\d\d|GOPR){found[1]}" if found else "", re.IGNORECASE)
+    kind = path.stem[:2].upper()
+    return [
+        p
+        for p in others
+        if p != path and same.fullmatch(p.stem) and (kind in ("GP", "GO") or p.stem[:2].upper() == kind)
+    ]
 
 
 def _time_base(stream: VideoStream) -> Fraction:

@@ -314,6 +314,18 @@ def test_damaged_heads_end_in_one_line(tmp_path):
             assert "\n" not in str(error)  # noqa: PT017
 
 
+@pytest.mark.parametrize(("name", "others", "said"), [
+    ("GX010012.MP4", ["GX020012.MP4", "GX030012.MP4", "GX010013.MP4"], 3), ("GOPR0012.MP4", ["GP010012.MP4"], 2),
+    ("GX010012.MP4", ["GX010013.MP4", "GL010012.LRV"], 0), ("walk.mp4", ["walk2.mp4"], 0),
+])  # fmt: skip
+def test_a_chapter_of_a_recording_is_said_to_be_one(tmp_path, caplog, name, others, said):
+    write_video(tmp_path / "v.mp4").rename(tmp_path / name)
+    for other in others:
+        (tmp_path / other).write_bytes(b"")
+    open_source(tmp_path / name).close()
+    assert (f"is one of {said} chapters" in caplog.text) == (said > 0)
+
+
 @pytest.mark.parametrize(("rate", "said"), [("240.000000", True), ("120", True), ("30.0", False), ("x", False)])
 def test_a_capture_rate_above_the_videos_is_slow_motion(tmp_path, caplog, rate, said):
     path = tmp_path / "slow.mp4"
