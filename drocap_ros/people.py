@@ -7,7 +7,6 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,18 +32,6 @@ logger = logging.getLogger(__name__)
 _LEAST_S, _LEAST_IMAGES = 1.0, 12
 
 
-class TrackedPeople(NamedTuple):
-    """Tracks by the numbers of ``drocap track --list``; words about those left out; origin of all, for ``meta``."""
-
-    tracks: dict[int, Tracks]
-    left_out: list[str]
-    origin: Values
-
-    def words(self) -> list[str]:
-        """A line about each: from when to when, and in how many of the images."""
-        return [f"person {number}: {_when(tracks)}" for number, tracks in self.tracks.items()]
-
-
 def track_people(
     path: str | Path,
     config: DrocapConfig,
@@ -52,8 +39,11 @@ def track_people(
     selection: Selection,
     progress: Progress | None = None,
     on_frame: Callable[[Frame, list[PoseObservation]], None] | None = None,
-) -> TrackedPeople:
-    """2D tracks of everybody, or of the selected people, in the selected part of a source's images."""
+) -> tuple[dict[int, Tracks], Values]:
+    """2D tracks of everybody, or of the selected people, in the selected part of a source's images, and their origin.
+
+    They have the numbers of ``drocap track --list``; ``left_out`` of the origin has words about others.
+    """
     path = Path(path)
     if selection.evidence is not None:
         raise InputError("--evidence: expected one person, found several to reconstruct; choose one with --subject N")
@@ -83,10 +73,11 @@ def track_people(
     origin: Values = {"pose2d": "estimated", "people": list(kept), "left_out": left_out}
     origin["images"] = {"size": size, "length": images.length, "rate_hz": images.rate_hz}
     origin["images"] |= {"topic": selection.topic} if selection.topic else {}
-    return TrackedPeople(kept, left_out, origin | ({} if selection.clip.whole else {"clip": selection.clip.meta}))
+    return kept, origin | ({} if selection.clip.whole else {"clip": selection.clip.meta})
 
 
-def _when(tracks: Tracks) -> str:
+def when(tracks: Tracks) -> str:
+    """From when to when tracks show their person, and in how many of the images."""
     seen = np.isfinite(tracks.keypoints).all(axis=2).any(axis=1)
     first, last = ((int(tracks.stamp_ns[at]) - int(tracks.stamp_ns[0])) * 1e-9 for at in np.flatnonzero(seen)[[0, -1]])
     return f"{first:.1f} to {last:.1f} s, in {int(seen.sum())} of {len(tracks)} images"
@@ -124,7 +115,7 @@ def reconstruct_everybody(
     if method == "live":
         raise InputError("--method live: expected a recording of one person's poses; choose another method")
     begin = time.perf_counter()
-    tracks, _, origin = track_people(path, config, models, selection, progress)
+    tracks, origin = track_people(path, config, models, selection, progress)
     seen = {number: int(np.isfinite(t.keypoints).any(axis=(1, 2)).sum()) for number, t in tracks.items()}
     lead = max(seen, key=lambda number: (seen[number], -number))
     placed, more = _with_camera_of_input(path, tracks[lead], config, telemetry or Telemetry(), selection, progress)
@@ -137,7 +128,7 @@ def reconstruct_everybody(
     )
     found = {}
     for number, motion in motions.items():
-        own: Values = {**origin, **more, "person": number, "seen": _when(tracks[number])}
+        own: Values = {**origin, **more, "person": number, "seen": when(tracks[number])}
         found[number] = with_origin(motion, path, own, seconds), tracks[number]
     return found
 

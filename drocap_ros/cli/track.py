@@ -163,15 +163,16 @@ def _track_people(job: _Job) -> str:
     """Write the tracks of everybody, or of the selected people, and the overlay; returns a line for each."""
     args, config, models, selection, target, progress = job
     from drocap_ros.open_images import open_images
-    from drocap_ros.people import track_people
+    from drocap_ros.people import track_people, when
     from drocap_ros.report.overlay import OverlayVideo
 
     with open_images(args.video, config.image_ingest, args.topic) as images:
         drawn = OverlayVideo(target / "overlay.mp4", images.rate_hz, with_points=args.points)
     with drawn if args.overlay else contextlib.nullcontext():
-        found = track_people(args.video, config, models, selection, progress, drawn.add if args.overlay else None)
-    save_people_tracks(target, found.tracks)
-    return "\n".join([*found.words(), *found.left_out])
+        on_frame = drawn.add if args.overlay else None
+        found, origin = track_people(args.video, config, models, selection, progress, on_frame)
+    save_people_tracks(target, found)
+    return "\n".join([*(f"person {n}: {when(tracks)}" for n, tracks in found.items()), *origin["left_out"]])
 
 
 def _summary(found: list[tuple[int, int]], frames: int) -> str:

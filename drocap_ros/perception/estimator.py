@@ -14,14 +14,14 @@ from drocap_ros.errors import InputError
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.load_models import limited_use, load_detector, load_feet_model, load_pose_model
 from drocap_ros.perception.load_shedding import KeypointFlow
-from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
+from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, SEEN, BodyPose, BodyPoseModel
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
 from drocap_ros.perception.scene import JITTER_NS, Scene, SceneStep
 from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.tracking.camera_motion import sweeps
 from drocap_ros.perception.tracking.choice import CERTAIN_SCORE
 from drocap_ros.perception.tracking.other_poses import OtherPoses
-from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Subject
+from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, Subject
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.search import SubjectSearch
 from drocap_ros.perception.tracking.subject import SubjectTracker
@@ -221,7 +221,7 @@ class PoseEstimator:
 
     def _is_in_view(self, subject: Subject) -> bool:
         """Whether a detected subject's last pose, doubtful as it is, may be a person's."""
-        return subject.score > 0 and (self._confidence >= EMPTY_CONFIDENCE or sweeps(self.motion, subject.box))
+        return subject.score > 0 and (self._confidence >= SEEN or sweeps(self.motion, subject.box))
 
     def _clear_margins(self, subject: Subject, pose: BodyPose) -> np.ndarray | None:
         """(4,) margins of the box around the joints, over their longer extent; None unless both are clear."""

@@ -16,14 +16,14 @@ from drocap_ros.errors import InputError
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.nms import MOSTLY, iou, overlap_coefficient
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, LEAST_BESIDE, BodyPose
+from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, LEAST_BESIDE, SEEN, BodyPose
 from drocap_ros.perception.scene import JITTER_NS
 from drocap_ros.perception.sources.base import Frame, prefetch, with_next
 from drocap_ros.perception.track_video import tracks_from_observations
 from drocap_ros.perception.tracking.appearance import describe, limb_colours
 from drocap_ros.perception.tracking.association import found_again
 from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, ExpectedJoints, Poses, own_joints
-from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, DOUBT_S, EMPTY_CONFIDENCE, Person, Subject
+from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, DOUBT_S, Person, Subject
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
@@ -226,11 +226,11 @@ class PeopleEstimator:
         own = (joint >= 0) & inside & (confidence >= least)
         believed = float(np.where(own, confidence, 0.0)[: len(BODY_15)].mean())
         recent = (stamp_ns - expected.detected_ns) * 1e-9 <= DOUBT_S
-        needed = 0.0 if recent and others else EMPTY_CONFIDENCE if recent else CLEAR_CONFIDENCE
-        sure = own & (confidence >= EMPTY_CONFIDENCE)
+        needed = 0.0 if recent and others else SEEN if recent else CLEAR_CONFIDENCE
+        sure = own & (confidence >= SEEN)
         if believed < needed or sure[: len(BODY_15)].sum() < LEAST_JOINTS:
             return
-        expected.accept(xy, sure, believed >= EMPTY_CONFIDENCE)
+        expected.accept(xy, sure, believed >= SEEN)
         box = expected.box
         person.measure(box, stamp_ns)
         person.pose.judge(believed, box, stamp_ns)
@@ -271,7 +271,7 @@ class PeopleEstimator:
 
     def _is_followed(self, pose: BodyPose, stamp_ns: int) -> bool:
         """Whether these joints are already someone's."""
-        sure = pose.confidence >= EMPTY_CONFIDENCE
+        sure = pose.confidence >= SEEN
         for _, joints in self._followed():
             if (seen := joints.seen_in(stamp_ns)) is not None:
                 apart = np.linalg.norm(seen.keypoints[: len(pose.xy)] - pose.xy, axis=1)[sure]

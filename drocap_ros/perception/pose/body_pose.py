@@ -119,7 +119,7 @@ CLEAR_CONFIDENCE = 0.8  # mean confidence of a clear pose; persons in bad light 
 LEAST_BESIDE = (
     0.6  # least confidence of a joint in another's box, too: of the own ones 5 % have less, of others' the half
 )
-SEEN = 0.3  # least confidence of a joint that counts: boxes without a person have a mean below 0.33
+SEEN = 0.3  # least confidence of a joint, and mean of a pose, that count: boxes without a person hardly have more
 SAME_JOINTS = 0.05  # median distance of one person's joints in two boxes, share of the body's longer extent
 BOX_MARGIN = 0.06  # of a person's box around the joints, share of their longer extent: head and feet
 _PATCH_PX = 32  # side of the patch in which a shadow is sought

@@ -127,9 +127,8 @@ def _to_box(state: np.ndarray) -> np.ndarray:
     return np.concatenate([state[:2] - half, state[:2] + half])
 
 
-#: Mean confidence of the joints: on boxes without a person below this,
-EMPTY_CONFIDENCE = 0.33
-#: of a believable pose from here on: shadows have 0.2 to 0.6, persons in bad light or from steeply above 0.5 to 0.9;
+#: Mean confidence of the joints of a believable pose from here on: shadows have 0.2 to 0.6, persons in bad light or
+#: from steeply above 0.5 to 0.9;
 CONFIRM_CONFIDENCE = 0.5
 #: of a pose that is certainly a person's from here on.
 SURE_CONFIDENCE = 0.7
