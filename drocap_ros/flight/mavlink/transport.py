@@ -35,7 +35,12 @@ class _TakenError(InputError):
 
 
 class Transport(Protocol):
-    """Carries bytes to and from an autopilot."""
+    """Carries bytes to and from an autopilot.
+
+    sender : of the latest datagram; None = there is one peer
+    """
+
+    sender: Address | None = None
 
     def read(self, timeout_s: float) -> bytes:
         """Bytes that arrive within the time, maybe none.  Raises LinkError when the link broke."""
@@ -44,7 +49,8 @@ class Transport(Protocol):
         """Send; False without a peer or without room."""
 
     def accept_peer(self) -> None:
-        """Send to the sender of the latest bytes from now on (listening UDP)."""
+        """Send to the sender of the latest datagram from now on; where there is one peer, do nothing."""
+        return
 
     def port(self) -> tuple[int, Address | None]:
         """Descriptor of the open port, and where its datagrams go; None = it is no port of datagrams."""
@@ -118,14 +124,13 @@ def _refusal(error: Exception) -> type[InputError]:
     return _TakenError if getattr(error, "errno", None) in _TAKEN else InputError
 
 
-class _UdpTransport:
+class _UdpTransport(Transport):
     def __init__(self, host: str, port: int, listen: bool) -> None:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._peer = None if listen else address
+        self._peer: Address | None = None if listen else address
         self._fixed_peer = not listen
-        self._sender = None
         try:
             if listen:
                 self._socket.bind(address)
@@ -137,7 +142,7 @@ class _UdpTransport:
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return b""
         try:
-            data, self._sender = self._socket.recvfrom(_MAX_DATAGRAM)
+            data, self.sender = self._socket.recvfrom(_MAX_DATAGRAM)
         except (BlockingIOError, ConnectionRefusedError):  # refused: no peer listens yet
             return b""
         return data
@@ -152,8 +157,8 @@ class _UdpTransport:
         return True
 
     def accept_peer(self) -> None:
-        if not self._fixed_peer and self._sender is not None:
-            self._peer = self._sender
+        if not self._fixed_peer and self.sender is not None:
+            self._peer = self.sender
 
     def port(self) -> tuple[int, Address | None]:
         return self._socket.fileno(), self._peer
@@ -162,7 +167,7 @@ class _UdpTransport:
         self._socket.close()
 
 
-class _TcpTransport:
+class _TcpTransport(Transport):
     def __init__(self, host: str, port: int) -> None:
         self._socket = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -190,9 +195,6 @@ class _TcpTransport:
         except OSError as error:
             raise LinkError(f"the TCP link to the autopilot broke: {error.strerror or error}") from None
 
-    def accept_peer(self) -> None:
-        """Do nothing: there is one peer."""
-
     def port(self) -> tuple[int, None]:
         return self._socket.fileno(), None
 
@@ -200,7 +202,7 @@ class _TcpTransport:
         self._socket.close()
 
 
-class _SerialTransport:
+class _SerialTransport(Transport):
     def __init__(self, port: serial.Serial) -> None:
         self._port = port
 
@@ -220,9 +222,6 @@ class _SerialTransport:
             return bool(self._port.write(data) == len(data))
         except Exception:  # noqa: BLE001  as above; what is not sent is a gap of the stream
             return False
-
-    def accept_peer(self) -> None:
-        """Do nothing: there is one peer."""
 
     def port(self) -> tuple[int, None]:
         return self._port.fileno(), None

@@ -236,8 +236,8 @@ def subject_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
         return outdated_condition(seen, oldest_s)
     if not seen.subject.sd_m <= safety.max_subject_sd_m:
         return condition(_C.SUBJECT_UNCERTAIN, sd_m=seen.subject.sd_m)
-    if _too_near(seen, limits):
-        near, room_m = seen.subject, stopping_room(seen, safety)
+    near, room_m = seen.subject, stopping_room(seen, safety)
+    if not near.distance_m - room_m >= limits.orbit.min_distance_m:
         values = {"distance_m": near.distance_m, "sd_m": near.sd_m, "limit_m": limits.orbit.min_distance_m}
         return condition(_C.SUBJECT_NEAR, room_m=room_m, **values)
     if seen.subject.distance_m > limits.orbit.max_distance_m:
@@ -265,10 +265,6 @@ def outdated_condition(seen: Observed, oldest_s: float) -> Condition:
     return condition(_C.OTHER_SUBJECT if seen.subject.contradicted else _C.SUBJECT_OUTDATED, age_s=age_s)
 
 
-def _too_near(seen: Observed, limits: Limits) -> bool:
-    return not seen.subject.distance_m - stopping_room(seen, limits.safety) >= limits.orbit.min_distance_m
-
-
 def stopping_room(seen: Observed, safety: SafetyConfig) -> float:
     """Distance (m) that may be lost between vehicle and subject until the vehicle stands, uncertainty included.
 
@@ -277,16 +273,12 @@ def stopping_room(seen: Observed, safety: SafetyConfig) -> float:
     the way that it flies away from him until it reacts.  A standard deviation of his position, and of his speed until
     the vehicle reacts, is added.
     """
-    toward = (
-        max(seen.subject.closing_m_s, -seen.subject.approach_m_s, 0.0) + OWN_SPEED_SD_M_S
-    )  # own speed and chase together
-    gaining = seen.subject.approach_m_s + min(seen.subject.closing_m_s, 0.0)  # on a vehicle that flies away
-    steps = max(gaining, 0.0) * REACTION_S + max(seen.subject.approach_m_s, 0.0) * toward / safety.braking_m_s2
-    return (
-        braking_distance(toward, safety)
-        + steps
-        + math.hypot(seen.subject.sd_m, REACTION_S * seen.subject.approach_sd_m_s)
-    )
+    closing_m_s, approach_m_s = seen.subject.closing_m_s, seen.subject.approach_m_s
+    toward = max(closing_m_s, -approach_m_s, 0.0) + OWN_SPEED_SD_M_S  # own speed and chase together
+    gaining = approach_m_s + min(closing_m_s, 0.0)  # on a vehicle that flies away
+    steps = max(gaining, 0.0) * REACTION_S + max(approach_m_s, 0.0) * toward / safety.braking_m_s2
+    unsure = math.hypot(seen.subject.sd_m, REACTION_S * seen.subject.approach_sd_m_s)
+    return braking_distance(toward, safety) + steps + unsure
 
 
 def oldest_state_s(safety: SafetyConfig, *, patient: bool = False) -> float:

@@ -44,6 +44,8 @@ class Measured:
     packet_loss : share of the autopilot's last packets that did not arrive
     systems : MAVLink systems of all autopilots on the link
     others : MAV_TYPE of ground stations, gimbals and the like, by system and component
+    addresses : systems and components heard by the address of their datagrams, the one first to which setpoints go;
+        empty = the port has one peer
     conditions : conditions for motion that failed, with the share of the time, in the order of the checks; as if the
         vehicle were armed and in the air
     bridge : state and reason of the running bridge that was listened to; "" = the link itself
@@ -64,6 +66,7 @@ class Measured:
     packet_loss: float = 0.0
     systems: frozenset[int] = frozenset()
     others: Mapping[tuple[int, int], int] = field(default_factory=dict)
+    addresses: Mapping[str, frozenset[tuple[int, int]]] = field(default_factory=dict)
     conditions: tuple[tuple[Condition, float], ...] = ()
     bridge: str = ""
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import UNKNOWN, Autopilot, autopilot_of
 from drocap_ros.flight.autopilot.autopilot import Level
@@ -36,7 +37,7 @@ def link_findings(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[F
         yield _losses(measured)
     if len(measured.systems) > 1:
         yield _several(config, measured)
-    if measured.others:
+    if measured.others or len(measured.addresses) > 1:
         yield _others(measured)
     for name, stream in measured.streams.items():
         if name != _MOUNT:  # the mount is a check of its own
@@ -76,8 +77,16 @@ _KINDS = {6: "ground station", 18: "companion computer", 26: "gimbal", 27: "ADS-
 
 @check("others", "who else is heard")
 def _others(measured: Measured) -> Finding:
-    names = [f"{_KINDS.get(kind, f'type {kind}')} {at[0]}/{at[1]}" for at, kind in sorted(measured.others.items())]
-    return Finding(graded(), ", ".join(names), values={"others": ", ".join(names)})
+    """Every other component, and every address beside the one to which setpoints go."""
+    others = [f"{_KINDS.get(kind, f'type {kind}')} {at[0]}/{at[1]}" for at, kind in sorted(measured.others.items())]
+    (_, own), *rest = measured.addresses.items() or (("", frozenset()),)
+    whose = [", ".join(f"{system}/{component}" for system, component in sorted(heard)) for _, heard in rest]
+    addresses = [f"{at} ({who or 'no MAVLink'})" for (at, _), who in zip(rest, whose, strict=True)]
+    twice = any(component == mavlink.MAV_COMP_ID_AUTOPILOT1 for _, heard in rest for _, component in heard & own)
+    remedy = "let one sender alone pass the autopilot's packets: setpoints go where its last heartbeat came from"
+    values = {"others": ", ".join(others), "addresses": ", ".join(addresses)}
+    wanted = "the autopilot from one address" if rest else ""
+    return Finding(graded(warning=twice), ", ".join([*others, *addresses]), wanted, remedy, values)
 
 
 @check("vehicles", "vehicles on the link", _C.SEVERAL_VEHICLES)
@@ -90,7 +99,8 @@ def _several(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
 def _rate(
     config: MavlinkBridgeConfig, measured: Measured, name: str, stream: Stream
 ) -> tuple[Finding, tuple[ConditionCode, ...]]:
-    (limit_s, conditions), (real, wanted, gap_s) = _limit(config, name), stream
+    parameter, conditions = _WATCHED.get(name, ("", ()))
+    limit_s, (real, wanted, gap_s) = float(getattr(config, parameter, 0.0)), stream
     found = f"{real:.1f} Hz" + (f", longest gap {gap_s:.2f} s" if real > 0 and math.isfinite(gap_s) else "")
     needed = f"{wanted:g} Hz, gaps below {limit_s:g} s" if limit_s else f"{wanted:g} Hz"
     autopilot = _autopilot(measured)
@@ -116,12 +126,6 @@ def _judged(stream: Stream, limit_s: float, *, short: bool) -> tuple[Level, str]
     if 0.0 < limit_s < stream.longest_gap_s:
         return Level.WARNING, f"a gap above {limit_s:g} s ends an orbit by a hold; "
     return Level.OK, ""
-
-
-def _limit(config: MavlinkBridgeConfig, name: str) -> tuple[float, tuple[ConditionCode, ...]]:
-    """Greatest age of the message in flight, 0 = none, and the conditions that watch it."""
-    parameter, conditions = _WATCHED.get(name, ("", ()))
-    return getattr(config, parameter, 0.0), conditions
 
 
 @check("telemetry_delay", "delay of telemetry", _C.ATTITUDE_OUTDATED)

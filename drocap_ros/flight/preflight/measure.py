@@ -18,7 +18,7 @@ from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.commands import Message
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.telemetry_request import AutopilotSettings
-from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.flight.mavlink.transport import Address, Transport
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import start_condition, vehicle_condition
 from drocap_ros.flight.orbit.observer import observe_vehicle
@@ -56,6 +56,7 @@ class ListeningLink(MavlinkLink):
         self.arrivals: defaultdict[str, list[int]] = defaultdict(list)
         self.exchanges: list[tuple[int, int]] = []  # round trip, offset, ns
         self.others: dict[tuple[int, int], int] = {}  # MAV_TYPE by system and component
+        self._senders: defaultdict[Address, set[tuple[int, int]]] = defaultdict(set)
         self._version_tries = 0
 
     def check_motion(self, message: Message) -> NoReturn:
@@ -68,8 +69,22 @@ class ListeningLink(MavlinkLink):
         """
         raise AssertionError(f"this link sends no {message.get_type()}")
 
+    def addresses(self) -> dict[str, frozenset[tuple[int, int]]]:
+        """Who was heard from which address; the one first to which setpoints would go."""
+        peer = self._transport.port()[1]
+        first = sorted(self._senders, key=lambda address: (address != peer, address))
+        return {f"{address[0]!s}:{address[1]!s}": frozenset(self._senders[address]) for address in first}
+
+    def _read(self, timeout_s: float) -> bytes:
+        data = super()._read(timeout_s)
+        if data and self._transport.sender is not None:
+            self._senders[self._transport.sender] |= set()
+        return data
+
     def _take(self, message: Message, now_ns: int) -> VehicleState | None:
         name, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
+        if self._transport.sender is not None:
+            self._senders[self._transport.sender].add(source)
         if name == "HEARTBEAT" and source[1] != mavlink.MAV_COMP_ID_AUTOPILOT1:
             self.others[source] = message.type
         if name == "TIMESYNC" and message.tc1 and message.ts1 in self._sync_sent:
@@ -174,7 +189,7 @@ class Listening:
             delays_s=np.array([delay for at, delay in self._delays if at >= from_ns]),
             good_count=sum(map(len, link.arrivals.values())), bad_count=status.bad_count,
             unsigned_count=status.refused_count, packet_loss=link.estimator.packets.loss,
-            systems=link.estimator.systems, others=link.others,
+            systems=link.estimator.systems, others=link.others, addresses=link.addresses(),
             conditions=tuple(
                 (self._examples[code], self._failed[code] / self._samples) for code in sorted(self._failed)
             ),
@@ -210,7 +225,12 @@ def all_findings(config: MavlinkBridgeConfig, setup: Setup, measured: Measured) 
     if not measured.heard:
         return [*found, _silence(config, measured)]
     found += link_findings(config, measured)
-    found += [_no_attitude()] if measured.vehicle is None else vehicle_findings(config, measured, measured.vehicle)
+    if measured.vehicle is None:
+        remedy = "wait until the autopilot has started; check that it may send ATTITUDE_QUATERNION"
+        verdict = Finding(Level.MISSING, "no attitude", "attitude and position", remedy)
+        found.append(verdict.named("vehicle", "vehicle"))
+    else:
+        found += vehicle_findings(config, measured, measured.vehicle)
     explained = {code for finding in found if finding.level != Level.OK for code in finding.conditions}
     found += [_unexplained(failed, share) for failed, share in measured.conditions if failed.code not in explained]
     return found
@@ -225,12 +245,6 @@ def _unexplained(failed: Condition, share: float) -> Finding:
     level, words = graded(missing=share > LASTING, warning=True), f"{failed} ({share:.0%} of the time)"
     verdict = Finding(level, words, "none that fails", "see docs/flight.md, conditions for motion", {"share": share})
     return verdict.named(f"condition_{failed.code.name.lower()}", "condition for motion", (failed.code,))
-
-
-@check("vehicle", "vehicle")
-def _no_attitude() -> Finding:
-    remedy = "wait until the autopilot has started; check that it may send ATTITUDE_QUATERNION"
-    return Finding(Level.MISSING, "no attitude", "attitude and position", remedy)
 
 
 @check("link", "link")

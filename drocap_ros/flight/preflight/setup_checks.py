@@ -241,19 +241,15 @@ def _unaimed_camera(
     return (Level.WARNING if problems else Level.OK), problems
 
 
-def person_in_picture(
-    config: MavlinkBridgeConfig, matrix: np.ndarray, pitch_down_deg: float, radius_m: float | None = None
-) -> Fit:
+def person_in_picture(config: MavlinkBridgeConfig, matrix: np.ndarray, pitch_down_deg: float) -> Fit:
     """Rows of a standing person at the orbit's distance; infinite = beside or behind the camera.
 
     matrix : (3, 3) px
     pitch_down_deg : of the optical axis against the horizon
-    radius_m : instead of the orbit's
     """
-    distance = config.radius_m if radius_m is None else radius_m
 
     def row(height_m: float) -> float:
-        angle = math.atan2(config.height_m - height_m, distance) - math.radians(pitch_down_deg)
+        angle = math.atan2(config.height_m - height_m, config.radius_m) - math.radians(pitch_down_deg)
         if abs(angle) >= 0.5 * math.pi:
             return math.copysign(math.inf, angle)
         return float(matrix[1, 2] + matrix[1, 1] * math.tan(angle))

@@ -19,11 +19,6 @@ _GOOD_SATELLITES = 8  # with fewer the position wanders by metres
 _MOUNT = "GIMBAL_DEVICE_ATTITUDE_STATUS"
 _FIXES = {0: "no receiver", 1: "no fix", 2: "2D", 3: "3D", 4: "3D, differential", 5: "RTK float", 6: "RTK fixed"}
 _LANDED = {**LANDED_STATES, LANDED_IN_AIR: "in the air"}
-#: Code, name, and what the bridge's own conditions want in the air.
-_IN_THE_AIR = (
-    ("subject", "subject", "located, farther than min_distance_m"),
-    ("place", "place and speed", "inside the limits"),
-)
 
 
 def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: VehicleState) -> Iterator[Finding]:
@@ -241,10 +236,12 @@ def _flies(vehicle: VehicleState) -> bool:
 
 def _waiting(autopilot: Autopilot) -> Iterator[Finding]:
     """What can be judged in the air only."""
-    rows = [*_IN_THE_AIR]
-    if autopilot.rest_flags:  # at rest the estimator shows nothing of them
-        rows.insert(0, ("estimator_flight", "position estimate in flight", "healthy"))
-    for code, name, wanted in rows:
+    rows = (
+        ("estimator_flight", "position estimate in flight", "healthy"),
+        ("subject", "subject", "located, farther than min_distance_m"),
+        ("place", "place and speed", "inside the limits"),
+    )
+    for code, name, wanted in rows[0 if autopilot.rest_flags else 1 :]:  # at rest the estimator shows nothing of flags
         verdict = Finding(Level.WAITS, "not judged on the ground", wanted, "hover, and see `drocap orbit status`")
         yield verdict.named(code, name)
 

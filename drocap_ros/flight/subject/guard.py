@@ -27,6 +27,7 @@ from drocap_ros.stamps import NS
 
 #: s; older pictures count less.  An orbit of 11 deg/s takes 33 s; the height of the worse autopilot wanders for longer.
 _MEMORY_S = 30.0
+_FORGETTING_M_S = 0.9  # of one who walks, at which a second is forgotten: his way is no error of the range
 #: s, for which errors of the vehicle's position last: recorded ones of both autopilots halve within 2 s.
 _LASTS_S = 5.0
 _LEAST_RESIDUAL_M2 = 0.05**2  # a body that stands sways: residuals that are smaller are chance
@@ -44,23 +45,21 @@ class Parallax:
 
     def __init__(self, size_error: float) -> None:
         self._size_error = size_error
-        self.scale = 1.0
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin anew, as where the subject walks; the scale stays what it was."""
-        self._prior = self.scale
+        self.scale = self._prior = 1.0
         self._seconds = 0.0
         self._sums: np.ndarray = np.zeros(7)  # place (2), direction (2), place.place, place.direction, range: by time
 
-    def take(self, place: np.ndarray, sight: np.ndarray, seconds: float) -> None:
-        """Take a picture.
+    def take(self, place: np.ndarray, sight: np.ndarray, seconds: float, speed_m_s: float) -> None:
+        """Take a picture; the faster the subject, the sooner the ones before count no more, and the scale stays.
 
         place : (2,) m, of the camera in the map frame
         sight : (2,) m, from there to the subject as measured, without this scale
         seconds : since the picture before
+        speed_m_s : of the subject as estimated; of one who stands it errs by 0.5 m/s, and by 1 m/s for a moment
         """
-        fade = math.exp(-seconds / _MEMORY_S)
+        kept = math.exp(-seconds * (speed_m_s / _FORGETTING_M_S) ** 8)
+        self._prior = self.scale + kept * (self._prior - self.scale)
+        fade = kept * math.exp(-seconds / _MEMORY_S)
         self._seconds = fade * self._seconds + seconds
         distance = float(np.hypot(*sight))
         toward = sight / max(distance, 1e-3)

@@ -135,10 +135,7 @@ class SubjectFilter:
         self._stamp_ns, self._contradicted = observation.stamp_ns, False
         self._nearer += (measurement.nearer - self._nearer) * min(gap_s / _NEARER_S, 1.0)
         self._learn_ground(measurement, observation.stamp_ns)
-        if float(np.hypot(*self._state[3:5])) > WALKING_M_S:
-            self._parallax.forget()
-        else:
-            self._parallax.take(camera.position[:2], sight[:2], gap_s)
+        self._parallax.take(camera.position[:2], sight[:2], gap_s, float(np.hypot(*self._state[3:5])))
         return True
 
     def _restart(self, observation: PoseObservation, measurement: SubjectMeasurement, *, locked: bool) -> bool:

@@ -8,6 +8,8 @@ import random
 import socket
 from collections.abc import Callable
 
+from drocap_ros.flight.mavlink.transport import Transport
+
 
 def free_udp_port() -> int:
     """A free UDP port on loopback."""
@@ -63,8 +65,8 @@ def is_setpoint(packet: bytes) -> bool:
     return packet[:1] == b"\xfd" and packet[7:10] == b"\x54\x00\x00"
 
 
-class LoopbackTransport:
-    """A :class:`drocap_ros.flight.mavlink.transport.Transport` over two channels; it never waits."""
+class LoopbackTransport(Transport):
+    """A transport over two channels; it never waits."""
 
     def __init__(self, incoming: Channel, outgoing: Channel) -> None:
         self._incoming, self._outgoing = incoming, outgoing
@@ -81,9 +83,6 @@ class LoopbackTransport:
     def port(self) -> tuple[int, None]:
         """None: nothing is open."""
         return -1, None
-
-    def accept_peer(self) -> None:
-        """Do nothing: there is one peer."""
 
     def close(self) -> None:
         """Do nothing."""

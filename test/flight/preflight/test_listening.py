@@ -38,9 +38,10 @@ class Scene:
         )
         self.copter.armed, self.copter.landed_state = False, 1
         self.copter.settings.update({**FENCE[autopilot], **settings})
+        self.port = LoopbackTransport(self.down, self.up)
         listening = Listening(
             config, seconds, clock_ns=lambda: int((self.t + 1e9) * 1e9), monotonic_s=lambda: self.t,
-            transport=LoopbackTransport(self.down, self.up),
+            transport=self.port,
         )  # fmt: skip
         with pytest.raises(AssertionError):  # whoever asks
             listening.link.send_motion(listening.link.mav.set_position_target_local_ned_encode(0, 1, 1, 1, *[0] * 12))
@@ -75,6 +76,39 @@ def test_a_ground_station_on_the_link_is_named():
     found = Scene("px4", before=station).findings["others"]
     assert found.found == "ground station 255/190"
     assert found.level == Level.OK
+
+
+def _packet(system, component):
+    mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(mav)
+
+
+@pytest.mark.parametrize(
+    ("packet", "who", "level"),
+    [
+        (_packet(255, 190), "255/190", Level.OK),
+        (_packet(1, 154), "1/154", Level.OK),
+        (_packet(1, 1), "1/1", Level.WARNING),
+        (b"hello", "no MAVLink", Level.OK),
+    ],
+)
+def test_every_address_beside_the_autopilots_is_named(packet, who, level):
+    own, foreign = ("10.0.0.2", 14550), ("10.0.0.7", 5000)
+
+    def speak(scene):
+        read, port = scene.port.read, scene.port
+
+        def read_either(wait_s):
+            port.sender = foreign if round(scene.t * 100) % 7 == 0 else own
+            return packet if port.sender is foreign else read(wait_s)
+
+        port.read, port.port = read_either, lambda: (-1, own)
+
+    found = Scene("px4", before=speak).findings["others"]
+    assert f"10.0.0.7:5000 ({who})" in found.found
+    assert "10.0.0.2" not in found.found
+    assert found.level == level
+    assert bool(found.remedy) == (level == Level.WARNING)
 
 
 @BOTH

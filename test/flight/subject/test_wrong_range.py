@@ -16,10 +16,10 @@ from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 S = 1_000_000_000
 
 
-def estimated(factor=1.0, ground_m=0.0, action="stand"):
+def estimated(factor=1.0, ground_m=0.0, action="stand", seconds=8.0):
     """The filter's estimate of a person of 1.7 m whose image is scaled, and the true distance from the camera."""
     settings = SimulationConfig(action=action, stature_m=1.7, attitude_error_deg=0.3, position_error_m=0.0)
-    capture = simulate_capture(8.0, 15.0, 3, settings)
+    capture = simulate_capture(seconds, 15.0, 3, settings)
     tracks, subject = capture.tracks, SubjectFilter(SubjectConfig(ground_height_m=ground_m))
     middle = np.nanmean(tracks.keypoints, axis=1, keepdims=True)
     keypoints = ((tracks.keypoints - middle) * factor + middle).astype(np.float32)
@@ -42,7 +42,7 @@ def test_agreeing_ranges_leave_no_doubt(action):
 
 @pytest.mark.parametrize("factor", [0.6, 0.75])
 def test_a_small_image_is_doubted_by_the_ground(factor):
-    estimate, distance, truth = estimated(factor)
+    estimate, distance, truth = estimated(factor, seconds=2.0)  # the own way corrects the range later
     assert distance > 1.1 * truth
     assert (1 - estimate.nearer) * distance < 1.2 * truth
 
