@@ -106,7 +106,7 @@ class JoinedProblem:
         doubt = Doubt(lens=(0.0, view.focal_std), lean_std=_LEAN)
         if number == self.home:
             return doubt
-        home, wander_m = self.views[self.home], 0.0 if view.stands else _WANDER_M
+        home, wander_m = self.views[self.home], 0.0 if view.own_world and view.stands else _WANDER_M
         placed = doubt._replace(placed_m=_PLACED_M, wander_m=wander_m)
         if view.reported and home.reported:
             return placed

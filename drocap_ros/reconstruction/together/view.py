@@ -71,11 +71,10 @@ class View:
                 # Of reports the camera before the adjustment: its errors are to be found with all views.
                 camera = camera.moved(motion.camera_rotation, motion.camera_position)
             view = View(solved, motion.joints3d[:, :17], camera, True, _STANDING)
-            if camera.upright:
-                config = config_of(camera, world_config(solved.settings.adjuster))
-                return replace(view, config=replace(config, checks=False))
-            # A path whose up is unsure was not adjusted with the body: it errs as any that moves.
-            return view if view.stands else replace(view, config=WorldConfig(checks=False))
+            if view.stands and not camera.upright:
+                return view
+            config = WorldConfig() if camera.errors is None else config_of(camera, world_config(solved.settings.adjuster))
+            return replace(view, config=replace(config, checks=False))
         turn = np.broadcast_to(LEVEL_CAMERA, motion.camera_rotation.shape).copy()
         standing = camera.moved(turn, np.zeros((len(turn), 3)))
         view = View(solved, motion.joints3d, standing, False, _STANDING)
