@@ -54,6 +54,10 @@ class ClockOffset:
         self._window_ns = int(window_s * NS)
         self._one_way_window_ns = int(one_way_window_s * NS)
         self._jump_ns = int(jump_s * NS)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
         self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=512)  # received, round trip, offset
         self._best: tuple[int, int, int] | None = None
         self._rate = 0.0  # of the offset
@@ -134,14 +138,6 @@ class ClockOffset:
             return received_ns
         stamp = min(remote_ns + offset, received_ns)
         return stamp if received_ns - stamp <= 5 * NS else received_ns
-
-    def reset(self) -> None:
-        """Forget everything."""
-        self._exchanges.clear()
-        self._fastest.clear()
-        self._best = None
-        self._rate = 0.0
-        self._suspects = 0
 
 
 #: Flags of a usable estimate: all of these, and either horizontal position.

@@ -73,7 +73,9 @@ class View:
             view = View(solved, motion.joints3d[:, :17], camera, True, _STANDING)
             if view.stands and not camera.upright:
                 return view
-            config = WorldConfig() if camera.errors is None else config_of(camera, world_config(solved.settings.adjuster))
+            config = (
+                WorldConfig() if camera.errors is None else config_of(camera, world_config(solved.settings.adjuster))
+            )
             return replace(view, config=replace(config, checks=False))
         turn = np.broadcast_to(LEVEL_CAMERA, motion.camera_rotation.shape).copy()
         standing = camera.moved(turn, np.zeros((len(turn), 3)))
