@@ -21,7 +21,7 @@ from drocap_ros.errors import DrocapError, InputError
 COMMANDS = (
     "demo.command", "graph.live", "graph.preflight", "view", "graph.orbit", "graph.record", "graph.replay",
     "sample", "track", "reconstruct", "batch", "export", "report", "info", "recover",
-    "graph.top", "models", "evaluate",
+    "graph.top", "models", "calibrate", "evaluate",
 )  # fmt: skip
 
 
@@ -79,7 +79,7 @@ def main(argv: Sequence[str] | None = None, parser: LineParser | None = None) ->
         args.command_line = shlex.join(["drocap", *words])
         # The networks' own words are no warning about an input.
         words_of_networks = logging.ERROR if getattr(args, "quiet", False) else logging.NOTSET
-        logging.getLogger("drocap_ros.perception.estimator").setLevel(words_of_networks)
+        logging.getLogger("drocap_ros.perception.estimator.networks").setLevel(words_of_networks)
         with interruptible(getattr(args, "interrupted_by", BOTH)) as interrupted:
             status: int = args.run(args)
         sys.stdout.flush()

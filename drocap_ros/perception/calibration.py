@@ -50,6 +50,26 @@ class CameraModel:
             flat[seen] = undo(given, self.matrix, self.distortion, P=self.matrix)[:, 0]
         return flat
 
+    def yaml(self, name: str) -> str:
+        """Text of a file as ROS's ``camera_calibration`` writes it."""
+        import yaml
+
+        def table(rows: int, columns: int, values: np.ndarray) -> dict[str, object]:
+            return {"rows": rows, "cols": columns, "data": [round(float(v), 8) for v in values.ravel()]}
+
+        projection = np.column_stack([self.matrix, np.zeros(3)])
+        content = {
+            "image_width": self.width,
+            "image_height": self.height,
+            "camera_name": name,
+            "camera_matrix": table(3, 3, self.matrix),
+            "distortion_model": self.distortion_model,
+            "distortion_coefficients": table(1, len(self.distortion), self.distortion),
+            "rectification_matrix": table(3, 3, np.eye(3)),
+            "projection_matrix": table(3, 4, projection),
+        }
+        return str(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+
     def resized(self, width: int, height: int) -> CameraModel:
         """The same lens at another image size."""
         scale = np.array([width / self.width, height / self.height, 1.0])

@@ -49,7 +49,7 @@ class PoseEstimator:
         #: Notice of a network that is not for images of real people; else empty.
         self.limited_use = limited_use(self.pose_model.model) or limited_use(self.detector.model)
         if self.limited_use:
-            log.warning("networks in use: %s", self.limited_use)
+            log.getChild("networks").warning("networks in use: %s", self.limited_use)
         self.tracker = SubjectTracker(self.config)
         self.search = SubjectSearch(self.detector, self.tracker, self.config)
         self.body = BodyPoseModel(self.pose_model)

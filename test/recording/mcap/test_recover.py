@@ -59,8 +59,8 @@ def test_damage_in_the_middle_loses_one_chunk_and_keeps_the_damaged_file(tmp_pat
     with open_session(folder) as session:
         readable = len(list(session.raw_messages()))
     (file,) = recover_session(folder)
-    assert file.messages > readable + 10
-    assert 0.7 * len(capture.tracks) < file.messages < len(capture.tracks)
+    # Reading goes on behind the damage, too.
+    assert 0.7 * len(capture.tracks) < readable <= file.messages < len(capture.tracks)
     assert DamageKind.SKIPPED_BYTES in [d.kind for d in file.damage]
     assert file.kept.read_bytes() == bytes(data)
     assert len(read_by_all(folder)["/drocap/pose2d"]) == file.messages
