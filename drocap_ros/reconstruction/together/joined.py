@@ -72,10 +72,10 @@ def _best_fit(home: View, view: View, name: str, to: str) -> tuple[TimeOffset, P
         return TimeOffset(0.0, 1.0), _SAME_WORLD
     found = time_offsets(home.shown(), view.shown())
     if not found or found[0].likeness < _LEAST_LIKENESS:
-        alike = f"a likeness of {found[0].likeness:.2f}" if found else "too short a time"
+        alike = f"a likeness of {found[0].likeness:.2f} at the best time" if found else "none that is alike"
         raise InputError(
-            f"{name}: expected the motion that {to} shows, for at least {LEAST_S:g} s, found {alike} at the best time;"
-            " are both of the same person at the same time?"
+            f"{name}: expected the motion that {to} shows, for at least {LEAST_S:g} s, found {alike}; are both of the"
+            " same person at the same time?"
         )
     if home.reported and view.reported and (agreed := _agreed(home, view, found)):
         return agreed, _SAME_WORLD
