@@ -10,7 +10,7 @@ from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.keypoints.body_check import is_no_body, limbs_of
 from drocap_ros.recording.keypoints.files import Stated, read_keypoints
 from drocap_ros.recording.keypoints.orders import ORDERS, joint_name
-from drocap_ros.report.checks import quality_sentence, run_checks
+from drocap_ros.report.checks import MotionCheck, quality_sentence, run_checks
 from drocap_ros.report.statistics import motion_statistics
 
 ACTIONS = ("walk", "boxing", "kicking", "squats", "mixed")
@@ -54,6 +54,16 @@ def test_a_body_is_not_doubted(action, seed):
     points = in_order(views(action, seed, height_m=1 + 1.3 * seed, start_deg=70 * seed)[2], "coco17", rng, 2.0)
     points[rng.random(points.shape[:2]) < 0.2] = np.nan
     assert not is_no_body(points, ORDERS["coco17"], strict=True)
+
+
+@pytest.mark.parametrize("height_m", [1.5, 5.0, 9.0, 20.0])
+@pytest.mark.parametrize("action", ACTIONS)
+def test_joints_that_our_networks_name_are_not_doubted_from_any_height(tmp_path, action, height_m):
+    points = in_order(views(action, 1, height_m=height_m)[2], "coco17", np.random.default_rng(1), 2.0)
+    np.savez(tmp_path / "k.npz", keypoints=points, joints=ORDERS["coco17"])
+    motion = reconstruct(read_keypoints(tmp_path / "k.npz", Stated(30.0, SIZE)))
+    motion.meta["pose2d"] = "estimated"
+    assert MotionCheck.NO_BODY not in {found.check for found in run_checks(motion, motion_statistics(motion))}
 
 
 def test_an_order_that_a_user_states_replaces_names_and_the_search(tmp_path, capsys):
