@@ -29,8 +29,9 @@ _NAMED = 5  # of them in a message
 _NORMALISED = 2.0
 #: Share of the picture's size beyond its edge at which networks still place joints of a person who is cut off.
 _OUTSIDE = 0.1
-#: Share of keypoints outside the picture from which they are none of it, as 3D poses about the hips.
-_MOST_OUTSIDE = 0.4
+#: Share of keypoints outside the picture along each axis from which they are none of it, as 3D poses about the hips: a
+#: person who is cut off is so at one side.
+_MOST_OUTSIDE = 0.2
 #: Scores a little above 1 are usual; COCO's flags end at 2.
 _HIGHEST_SCORE = 2.0
 #: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
@@ -312,15 +313,16 @@ def _check_scores(scores: np.ndarray) -> None:
 
 def without_unseen(path: Path, xy: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Keypoints (F, P, 2) with NaN for zeros, pairs below zero and places far outside, as other tools mark them."""
-    unseen = np.asarray((xy <= 0).all(axis=2)) | ((xy < -_OUTSIDE * size) | (xy > (1 + _OUTSIDE) * size)).any(axis=2)
+    outside = (xy < -_OUTSIDE * size) | (xy > (1 + _OUTSIDE) * size)
+    unseen = np.asarray((xy <= 0).all(axis=2)) | outside.any(axis=2)
     if not unseen.any() or unseen.all():
         return xy
     placed = np.isfinite(xy).all(axis=2) & (xy != 0).any(axis=2) & (xy != -1).any(axis=2)
-    share = (unseen & placed).sum() / max(placed.sum(), 1)
-    if share > _MOST_OUTSIDE:
+    share = (outside & placed[..., None]).sum(axis=(0, 1)) / max(placed.sum(), 1)
+    if share.min() > _MOST_OUTSIDE:
         raise InputError(
-            f"keypoints: expected px of an image of {size[0]}x{size[1]}, found {share:.0%} of them outside; convert"
-            " them, from its upper left corner"
+            f"keypoints: expected px of an image of {size[0]}x{size[1]}, found {share.min():.0%} of them outside along"
+            " each axis; convert them, from its upper left corner"
         )
     logging.getLogger(__name__).warning("%s: %d keypoints at (0, 0) or outside are not seen", path, unseen.sum())
     return np.where(unseen[..., None], np.nan, xy)

@@ -387,8 +387,9 @@ def _pixels(xy: np.ndarray, size: tuple[int, int] | None, spatial: bool) -> np.n
     """Points (F, P, 2) in px; those in shares of the picture are scaled, those in no picture refused."""
     hint = ", as of 3D poses" if spatial else ""
     low, high = float(np.nanmin(xy)), float(np.nanmax(xy))
-    below = float(np.mean(xy[np.isfinite(xy)] < 0))
-    if below > _MOST_BELOW:
+    below = (xy[np.isfinite(xy).all(axis=2)] < 0).mean(axis=0)
+    # Of two coordinates in px along each axis: who is cut off is so at one side.
+    if (below.mean() if spatial or high <= _LARGEST_SHARE else below.min()) > _MOST_BELOW:
         raise InputError(
             f"expected px of the whole picture, found coordinates from {low:.4g} to {high:.4g}{hint}, about a middle;"
             " convert them to px, x right and y down from the picture's corner; of 3D poses take their 2D keypoints"

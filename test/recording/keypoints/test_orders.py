@@ -56,6 +56,23 @@ def test_a_body_is_not_doubted(action, seed):
     assert not is_no_body(points, ORDERS["coco17"], strict=True)
 
 
+@pytest.mark.parametrize("order", ["coco17", "mediapipe33", "openpose25", "halpe26"])
+@pytest.mark.parametrize("side", ["right", "left", "below", "above"])
+@pytest.mark.parametrize("share", [0.35, 0.5, 0.7])
+def test_who_is_cut_off_at_one_side_of_the_picture_is_taken(tmp_path, order, side, share):
+    """Networks go on beyond the edge: before a webcam two thirds of the points lie below the picture."""
+    points = in_order(views("walk", 1)[2], order, np.random.default_rng(0))
+    low, high = np.min(points, axis=(0, 1)), np.max(points, axis=(0, 1))
+    axis, last = (0 if side in ("right", "left") else 1), side in ("right", "below")
+    scale = SIZE[1] / (share if axis else 1.25) / (high - low)[1]
+    place = np.array(SIZE) / 2 - scale * (low + high) / 2
+    edge = share * (high - low)[axis] * scale  # of the body in the picture
+    place[axis] = SIZE[axis] - edge - scale * low[axis] if last else edge - scale * high[axis]
+    np.savez(tmp_path / "k.npz", keypoints=scale * points + place, joints=ORDERS[order])
+    found = read_keypoints(tmp_path / "k.npz", Stated(30.0, SIZE))
+    assert np.isfinite(found.keypoints).all(axis=2).mean() > 0.1
+
+
 @pytest.mark.parametrize("height_m", [1.5, 5.0, 9.0, 20.0])
 @pytest.mark.parametrize("action", ACTIONS)
 def test_joints_that_our_networks_name_are_not_doubted_from_any_height(tmp_path, action, height_m):
