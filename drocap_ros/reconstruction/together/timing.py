@@ -48,9 +48,12 @@ class ShownMotion(NamedTuple):
     seen: np.ndarray
 
 
-def time_offsets(first: ShownMotion, second: ShownMotion) -> list[TimeOffset]:
-    """Offsets under which two motions are most alike, best first, at most four."""
-    a, b = _signals(first), _signals(second)
+def time_offsets(first: ShownMotion, second: ShownMotion, *, level: bool = True) -> list[TimeOffset]:
+    """Offsets under which two motions are most alike, best first, at most four.
+
+    level : z of both is up; else distances between joints are compared alone
+    """
+    a, b = _signals(first, level), _signals(second, level)
     score = _correlations(a, b)
     if score is None:
         return []
@@ -65,7 +68,7 @@ def time_offsets(first: ShownMotion, second: ShownMotion) -> list[TimeOffset]:
     return found
 
 
-def _signals(motion: ShownMotion) -> np.ndarray:
+def _signals(motion: ShownMotion, level: bool) -> np.ndarray:
     """(N, K) heights and distances of joints at ``RATE_HZ``, without what is slow: the same in every level view.
 
     They are 0 where no image shows the person.
@@ -76,7 +79,7 @@ def _signals(motion: ShownMotion) -> np.ndarray:
     at = indices(BODY_17.joints, _MOVING)
     one, other = np.triu_indices(len(at), 1)
     distance = np.linalg.norm(joints[:, at[one]] - joints[:, at[other]], axis=-1)
-    values = np.concatenate([joints[:, at, 2] - joints[:, :1, 2], _DISTANCE_WEIGHT * distance], axis=1)
+    values = np.concatenate([level * (joints[:, at, 2] - joints[:, :1, 2]), _DISTANCE_WEIGHT * distance], axis=1)
     even = np.arange(time[0], time[-1], 1.0 / RATE_HZ)
     values = np.stack([np.interp(even, time, column) for column in values.T], axis=1)
     smooth = max(_FAST_S, usual_step(time)) * RATE_HZ
