@@ -6,7 +6,6 @@ import contextlib
 import io
 import re
 import sqlite3
-from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
@@ -96,11 +95,7 @@ class BagScan(Session):
                 yield header, connection or content
 
     def _read_info(self) -> SessionInfo:
-        counts, times = Counter[tuple[str, str]](), list[int]()
-        for message in self.raw_messages():
-            counts[message.topic, message.type_name] += 1
-            times = [min([*times, message.log_time_ns]), max([*times, message.log_time_ns])]
-        return self._info_of("rosbag (.bag) without index", counts, times, {})
+        return self._counted("rosbag (.bag) without index")
 
 
 def _next_record(file: BinaryIO, place: int) -> int | None:
@@ -152,8 +147,8 @@ class SqliteScan(Session):
             ) as base:
                 known = {row[0]: (row[1], row[2]) for row in _rows_of(base, "SELECT id, name, type FROM topics")}
                 texts = dict(_rows_of(base, "SELECT topic_type, encoded_message_definition FROM message_definitions"))
-                last = next(_rows_of(base, "SELECT max(id) FROM messages"), (None,))[0]
-                stack = [(1, last or file.stat().st_size // _LEAST_ROW)]
+                last, most = next(_rows_of(base, "SELECT max(id) FROM messages"), (None,))[0], file.stat().st_size
+                stack = [(1, min(last or most, most // _LEAST_ROW))]  # a damaged number of a row may be any
                 while stack:
                     first, end = stack.pop()
                     try:
@@ -176,11 +171,7 @@ class SqliteScan(Session):
         return self._stores[kind, text].deserialize_cdr(raw.data, kind)
 
     def _read_info(self) -> SessionInfo:
-        counts, times = Counter[tuple[str, str]](), list[int]()
-        for message in self.raw_messages():
-            counts[message.topic, message.type_name] += 1
-            times = [min([*times, message.log_time_ns]), max([*times, message.log_time_ns])]
-        return self._info_of("rosbag2, SQLite", counts, times, {})
+        return self._counted("rosbag2, SQLite")
 
 
 def _rows_of(base: sqlite3.Connection, words: str) -> Iterator[tuple[Any, ...]]:

@@ -161,6 +161,14 @@ class Session(ABC):
         topics = tuple(TopicInfo(name, of, count) for (name, of), count in sorted(counts.items()))
         return SessionInfo(self.path, kind, topics, min(times, default=None), max(times, default=None), metadata)
 
+    def _counted(self, kind: str) -> SessionInfo:
+        """By reading all messages."""
+        counts, times = Counter[tuple[str, str]](), list[int]()
+        for message in self.raw_messages():
+            counts[message.topic, message.type_name] += 1
+            times = [min([*times, message.log_time_ns]), max([*times, message.log_time_ns])]
+        return self._info_of(kind, counts, times, {})
+
     def close(self) -> None:
         """Release the files, where they stay open between readings."""
         return

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
+import sqlite3
 
 import numpy as np
 import pytest
 from recorded import NAMES, START_NS, random_image
 
+from drocap_ros.recording.damaged_bags import SqliteScan
 from drocap_ros.recording.image_messages import read_images
 from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
@@ -83,3 +86,13 @@ def test_what_stands_behind_damage_is_read(tmp_path, messages, kind, share, leng
     assert lost < 0.1 * COUNT + 3 * length / (len(data) / COUNT)
     assert found[-1] > START_NS + 0.9 * COUNT * STEP_NS
     assert (np.diff(found) > 0).all()
+
+
+def test_a_damaged_number_of_a_row_is_not_waited_for(tmp_path):
+    """It may be any of 64 bits: rows are sought among as many as fit into the file."""
+    path = ros2_folder(tmp_path / "s", "SQLITE3")
+    with contextlib.closing(sqlite3.connect(path)) as base, base:
+        base.execute("UPDATE messages SET id = ? WHERE id = ?", (2**62, COUNT))
+    with contextlib.closing(SqliteScan(path, [path])) as session:
+        found = [raw.log_time_ns for raw in session.raw_messages()]
+    assert found == [START_NS + i * STEP_NS for i in range(COUNT - 1)]
