@@ -10,7 +10,7 @@ from drocap_ros.errors import InputError
 
 #: Error (px of a picture 1280 wide) and covered share of the picture beyond which the command says what to do better.
 _POOR_PX, _POOR_COVERED = 1.0, 0.5
-#: Time between two pictures of a film that are looked at: a board that moves shows itself anew.
+#: Time (s) between two pictures of a film that are looked at: the board has moved meanwhile.
 _STEP_S = 0.3
 
 
