@@ -7,11 +7,12 @@ from pathlib import Path
 
 from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig, load_config
+from drocap_ros.corrections import Corrections, load_corrections
 from drocap_ros.evaluation import compare as comparison
 from drocap_ros.evaluation.compare import MotionErrors
 from drocap_ros.motion import Motion, load_motion
 from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
-from drocap_ros.pipeline import Selection, reconstruct_input, selected_tracks
+from drocap_ros.pipeline import Selection, reconstruct_input, selected_tracks, with_corrections
 from drocap_ros.reconstruction.reconstruct import reconstruct as reconstruct_tracks
 from drocap_ros.recording.video_telemetry import Telemetry
 from drocap_ros.tracks import Tracks
@@ -28,6 +29,7 @@ def reconstruct(  # noqa: PLR0913 - the options of the command
     end_s: float = math.inf,
     subject: int | str = "",
     redetect: bool = False,
+    corrections: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Motion:
     """3D motion of the person in a video, image folder, recording, tracks file, or in tracks.
@@ -43,15 +45,17 @@ def reconstruct(  # noqa: PLR0913 - the options of the command
     subject : number of a person as ``drocap track --list`` numbers them, "largest", "centre", or a box
         "x_min,y_min,x_max,y_max" px in the first image; empty = as configured
     redetect : estimate the 2D poses of a recording from its images, although it holds recorded ones
+    corrections : YAML file of what is corrected by hand (:mod:`drocap_ros.corrections`)
     progress : called with a stage and its completed share; a negative share = unknown
     """
     settings = config if isinstance(config, DrocapConfig) else load_config(config or None)
     person, rule = parse_subject(str(subject))
     log = Telemetry(Path(telemetry)) if isinstance(telemetry, str | Path) else telemetry or Telemetry()
-    selection = Selection(Clip(start_s, end_s), person, redetect)
+    by_hand = load_corrections(corrections) if corrections else Corrections()
+    selection = Selection(Clip(start_s, end_s), person, redetect, corrections=by_hand)
     if isinstance(source, Tracks):
         return reconstruct_tracks(
-            selected_tracks(source, log, selection),
+            with_corrections(None, selected_tracks(source, log, selection), settings, None, None, selection),
             method=method,
             initializer=settings.initializer,
             adjuster=settings.bundle_adjuster,

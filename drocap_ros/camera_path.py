@@ -50,6 +50,7 @@ class UpSource(Enum):
     FEET = "the plane of resting feet"
     BODY = "the body's direction while it stands and walks"
     TOLD = "the attitude that was told"
+    LINES = "something vertical that was marked"
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ class PictureFacts:
     drift : (F, 2) standard deviations of position and turn (rad) after the best similarity; None = unknown
     up, up_std_deg : source of up and its deviation; None = there is none yet
     told : (3,) up in the path's axes, by an attitude that was told; told_std_deg : its deviation; None = nobody did
+    lines : (N, 3) normals of the planes of the camera and something vertical, in the path's axes
     scale_std : of the logarithm of the path's metres, NaN = the camera keeps its place
     feet_tell : resting feet measured them
     """
@@ -103,6 +105,7 @@ class PictureFacts:
     drift: np.ndarray | None = None
     told: np.ndarray | None = None
     told_std_deg: float = float("nan")
+    lines: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     up: UpSource | None = None
     up_std_deg: float = float("nan")
     scale_std: float = float("nan")

@@ -64,7 +64,8 @@ class RestingFeet:
 
     seen : (F, P) bool, of the joints; a toe or an ankle that no network sees is the lifter's guess and holds no foot
     fps : frames per second
-    looks : (F, 2) the lifter's probability that the right and the left foot rest; None = unknown
+    looks : (F, 2) the lifter's probability that the right and the left foot rest, 0 or 1 where somebody says so; None =
+        unknown
     start : (F, P, 3) m, joints before the adjustment, which show feet that part; None = unknown
     """
 
@@ -76,8 +77,11 @@ class RestingFeet:
         known[:, : len(ANKLES)] = ankles_seen(seen, fps)
         self._known = known[1:] & known[:-1]
         self._odds, self._together = np.ones((len(seen) - 1, 4)), np.ones((len(seen) - 1, 2))
+        self._said: np.ndarray = np.full((len(seen) - 1, 2), np.nan)
         if looks is not None:
-            sure = np.clip(0.5 * (looks[1:] + looks[:-1]), _LEAST_SURE, _MOST_SURE)
+            steps = 0.5 * (looks[1:] + looks[:-1])
+            self._said = np.where((steps == 0.0) | (steps == 1.0), steps, np.nan)
+            sure = np.clip(steps, _LEAST_SURE, _MOST_SURE)
             self._odds = np.tile(sure / (1.0 - sure), 2)
             if start is not None:
                 self._together = _resting_together(sure, parting_speed(start, fps))
@@ -101,7 +105,8 @@ class RestingFeet:
         total = both + moving * (right + left + moving)
         probability = np.empty_like(resting)
         probability[:, ::2], probability[:, 1::2] = (both + moving * right) / total, (both + moving * left) / total
-        return np.asarray(probability * self._known)
+        said = np.tile(self._said, 2)
+        return np.where(np.isfinite(said), said, probability * self._known)
 
 
 def step_speed(points: np.ndarray, rate_hz: float | np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import itertools
 import logging
 import threading
 import time
@@ -12,8 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig
+from drocap_ros.corrections import Corrections, corrected, spliced
 from drocap_ros.errors import InputError
 from drocap_ros.file_kind import missing
 from drocap_ros.keypoints import PoseObservation
@@ -55,6 +59,8 @@ class Selection:
     topic : of the images of a recording; empty: colour before grey, then that with most messages
     rate_hz : true rate of the images where a video plays them slower
     evidence : file of 3D poses of its images by another system
+    corrections : by hand; their times are those of the motion
+    images : of an input that has none
     people : numbers of those whom :mod:`drocap_ros.people` reconstructs; empty = everybody
     threads : that share the work on the images; the result is the same with any number
     on_image : called with each image of a video and its pose, in the order of time
@@ -67,6 +73,8 @@ class Selection:
     topic: str = ""
     rate_hz: float | None = None
     evidence: Path | None = None
+    corrections: Corrections = field(default_factory=Corrections)
+    images: Path | None = None
     people: tuple[int, ...] = ()
     threads: int = field(default=2, compare=False)
     on_image: Callable[[Frame, PoseObservation], None] = field(default=lambda *_: None, compare=False)
@@ -88,7 +96,7 @@ def reconstruct_input(
     telemetry: Telemetry = _FOUND,
     selection: Selection = _WHOLE,
 ) -> tuple[Motion, Tracks]:
-    """Motion of the subject in a video file, image folder, recording or tracks file.
+    """Motion of the subject in a video file, image folder, recording or tracks file, and its tracks before corrections.
 
     path : video, folder of images, ``.mcap``, rosbag1 ``.bag``, rosbag2 folder, or tracks ``.npz``
     method : one of :data:`drocap_ros.reconstruction.methods.METHODS`, or "live": the sliding windows of the live
@@ -112,6 +120,10 @@ def reconstruct_input(
     tracks, origin = input_tracks(Path(path), config, models, progress, telemetry, selection)
     if selection.evidence is not None:
         tracks = with_evidence(tracks, selection.evidence)
+    images = selection.images or (Path(path) if needs_networks(Path(path), selection.redetect) else None)
+    meant = with_corrections(images, tracks, config, models, progress, selection)
+    if selection.corrections:
+        origin["corrections"] = selection.corrections.values
     if selection.rate_hz:
         tracks = tracks.at_rate(selection.rate_hz)
     seconds = time.perf_counter() - begin
@@ -119,9 +131,58 @@ def reconstruct_input(
     from drocap_ros.reconstruction.reconstruct import reconstruct
 
     motion = reconstruct(
-        tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
+        meant, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
     return with_origin(motion, Path(path), origin, seconds), tracks
+
+
+def with_corrections(
+    images: Path | None,
+    tracks: Tracks,
+    config: DrocapConfig,
+    models: Path | None,
+    progress: Progress | None,
+    selection: Selection,
+) -> Tracks:
+    """Tracks at their true rate, as corrected by hand; ``images`` : where another person can be found, or None."""
+    rated = tracks.at_rate(selection.rate_hz) if selection.rate_hz else tracks
+    for span, box in selection.corrections.person:
+        rows = span.of((rated.stamp_ns - rated.stamp_ns[0]) * 1e-9)
+        if not rows.any():
+            raise InputError(f"person: expected a time within the recording, found {span.from_s:g} s; correct it")
+        other = None
+        if box is not None:
+            if images is None:
+                raise InputError("person: expected images for whoever is in a box, found none; name them: --video FILE")
+            settings = config.pose_estimator
+            settings = dataclasses.replace(settings, subject="box", subject_box=",".join(map(str, box)), on_loss="wait")
+            other = _person_at(images, tracks.stamp_ns[rows], config, settings, models, progress, selection)
+        rated = spliced(rated, rows, other)
+    return corrected(rated, selection.corrections)
+
+
+def _person_at(
+    path: Path,
+    stamp_ns: np.ndarray,
+    config: DrocapConfig,
+    settings: PoseEstimatorConfig,
+    models: Path | None,
+    progress: Progress | None,
+    selection: Selection,
+) -> Tracks:
+    """2D tracks of another person in the images of these times (F,)."""
+    estimator = PoseEstimator(models_folder(models or settings.models_dir), settings)
+    with open_images(path, config.image_ingest, selection.topic) as images:
+        until = itertools.takewhile(lambda frame: frame.stamp_ns <= stamp_ns[-1], images.frames)
+        meter = Clip().meter(progress, "2D pose", float(stamp_ns[-1] - stamp_ns[0]) * 1e-9)
+        frames = (frame for frame in until if frame.stamp_ns >= stamp_ns[0])
+        observations = observe(frames, estimator, meter, threads=selection.threads)
+    if [o.stamp_ns for o in observations] != stamp_ns.tolist():
+        raise InputError(f"{path}: expected the images of these tracks, found others; name the video that they are of")
+    try:
+        return tracks_from_observations(observations)
+    except InputError as error:
+        raise InputError(f"{path}: person: {error}") from None
 
 
 def input_tracks(
@@ -173,7 +234,8 @@ def read_input(
     """2D tracks of the subject, of the input where it holds them, else of its images, and their origin for ``meta``."""
     origin: Values = {} if selection.clip.whole else {"clip": selection.clip.meta}
     if needs_networks(path, selection.redetect):
-        tracks, more = _track(path, config, models, progress, selection)
+        # The most frequent subject of the whole recording is chosen at the end.
+        tracks, more = _track(path, config.replace("pose_estimator", on_loss="next"), models, progress, selection)
         return with_recorded(path, tracks, telemetry, selection), origin | more
     if path.suffix == ".npz":
         return selected_tracks(load_tracks(path), telemetry, selection), origin
@@ -248,8 +310,6 @@ def _track(
 ) -> tuple[Tracks, Values]:
     if selection.threads > 1:
         threading.Thread(target=_load_reconstruction, args=(config.bundle_adjuster.lifter,)).start()
-    # Offline the most frequent subject of the whole recording is chosen at the end.
-    config = config.replace("pose_estimator", on_loss="next")
     folder, clip = models_folder(models or config.pose_estimator.models_dir), selection.clip
     settings, begin_ns = follow_selected(path, config, folder, selection, progress)
     crowded, topic = list[bool](), selection.topic

@@ -51,14 +51,15 @@ class JointSet:
     @cached_property
     def mirror(self) -> np.ndarray:
         """(P,) int, the joint of the other body side for each joint (itself on the midline)."""
-        return np.array([self.joints.index(_other_side(j, self.joints)) for j in self.joints])
+        return np.array([self.joints.index(other_side(j, self.joints)) for j in self.joints])
 
 
 def _names(words: str) -> tuple[str, ...]:
     return tuple(words.split())
 
 
-def _other_side(joint: str, joints: tuple[str, ...]) -> str:
+def other_side(joint: str, joints: tuple[str, ...]) -> str:
+    """The joint of the other body side by its name; itself on the midline."""
     for a, b in (("l", "r"), ("r", "l"), ("left_", "right_"), ("right_", "left_")):
         if joint.startswith(a) and b + joint[len(a) :] in joints:
             return b + joint[len(a) :]

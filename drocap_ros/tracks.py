@@ -55,6 +55,8 @@ class Tracks:
     evidence, evidence_sigma : (F, P, 3) and (F, P), a 3D estimate of every image in its camera's axes, any unit, and
         its expected error; None
     real_lens : whether pictures of a lens were measured: one may be assumed where ``camera_matrix`` is None
+    resting : (F, 2) whether the right and the left foot rest, 1 or 0, as somebody says; NaN where nobody does; None
+    vertical : (N, 5) index of an image, lower and upper end px of something vertical in it, or None
     """
 
     keypoints: np.ndarray
@@ -70,6 +72,8 @@ class Tracks:
     evidence: np.ndarray | None = None
     evidence_sigma: np.ndarray | None = None
     real_lens: bool = False
+    resting: np.ndarray | None = None
+    vertical: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _check(self)
@@ -79,9 +83,16 @@ class Tracks:
 
     def of_frames(self, use: np.ndarray | slice) -> Tracks:
         """A choice of the frames, at least one: (F,) bool, distinct indices in any order, or a slice."""
-        values = {name: getattr(self, name) for name in (*_PER_FRAME, "keypoints", "stamp_ns")}
-        background = None if self.background is None else self.background.of_frames(np.arange(len(self))[use])
-        return replace(self, background=background, **{k: v[use] for k, v in values.items() if v is not None})
+        values = {name: getattr(self, name) for name in (*_PER_FRAME, "keypoints", "stamp_ns", "resting")}
+        images = np.arange(len(self))[use]
+        background = None if self.background is None else self.background.of_frames(images)
+        vertical = self.vertical
+        if vertical is not None:
+            row, image = np.nonzero(vertical[:, :1] == images)
+            vertical = np.column_stack([image, vertical[row, 1:]])
+        return replace(
+            self, background=background, vertical=vertical, **{k: v[use] for k, v in values.items() if v is not None}
+        )
 
     def at_rate(self, rate_hz: float) -> Tracks:
         """The same frames with ``rate_hz`` of them a second, gaps kept: slow motion at its true speed."""

@@ -28,6 +28,7 @@ from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
 if TYPE_CHECKING:
     from drocap_ros.config import DrocapConfig
+    from drocap_ros.corrections import Corrections
     from drocap_ros.motion import Motion
     from drocap_ros.recording.video_telemetry import Telemetry
 
@@ -145,6 +146,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="order of the joints in a file of keypoints that does not name them, as coco17, h36m17, openpose25 or"
         " mediapipe33 (default: the one that makes a body)",
     )
+    parser.add_argument(
+        "--video",
+        metavar="FILE",
+        type=Path,
+        help="with tracks as INPUT: the images that they are of; the report shows them",
+    )
+    parser.add_argument(
+        "--corrections",
+        metavar="YAML",
+        type=Path,
+        help="what is corrected by hand: joints, sides, feet, who is meant, what is vertical (`drocap app` writes it)",
+    )
     add_network_options(parser)
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     add_config_option(parser)
@@ -183,6 +196,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     telemetry = _telemetry(args)
+    corrections = _corrections(args, people)
     with (
         as_tracks_file(args.input, Stated(args.rate, args.image_size, args.order, person)) as source,
         progress_bars(args.quiet, _SHARES) as progress,
@@ -195,15 +209,24 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
             )
         rate_hz, person = (args.rate, person) if source == args.input else (None, None)
         selection = Selection(
-            clip, person, args.redetect, args.topic, rate_hz, args.evidence, people or (), args.threads
+            clip,
+            person,
+            args.redetect,
+            args.topic,
+            rate_hz,
+            args.evidence,
+            corrections,
+            args.video,
+            people or (),
+            args.threads,
         )
         if people is not None:
             text = reconstruct_people(args, source, out, config, telemetry, selection, progress)
             if not args.quiet:
                 print(text)
             return 0
-        shown = source == args.input and "report.html" in names and has_images(source)
-        with ImagesBeside(source if shown else None, progress, 4 if args.threads > 1 else 0) as images:
+        shown = args.video or (source if source == args.input and has_images(source) else None)
+        with ImagesBeside(shown if "report.html" in names else None, progress, 4 if args.threads > 1 else 0) as images:
             selection = dataclasses.replace(selection, on_image=images.keep)
             if args.threads > 1:
                 selection = dataclasses.replace(selection, on_tracks=images.begin)
@@ -224,6 +247,17 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
         if "report.html" in names:
             print(open_words(out / "report.html"))
     return 0
+
+
+def _corrections(args: argparse.Namespace, people: tuple[int, ...] | None) -> Corrections:
+    from drocap_ros.corrections import Corrections, load_corrections
+
+    if args.video and (args.input.suffix != ".npz" or not args.video.exists()):
+        found = f"found {args.input.name}" if args.video.exists() else "found no such file"
+        raise InputError(f"--video {args.video}: expected the images of tracks .npz as INPUT, {found}; correct it")
+    if args.corrections and (people is not None or args.method == "live"):
+        raise InputError(f"--corrections {args.corrections}: expected one person, offline; leave --all or live out")
+    return load_corrections(args.corrections) if args.corrections else Corrections()
 
 
 def _telemetry(args: argparse.Namespace) -> Telemetry:
@@ -300,6 +334,8 @@ _OF_ONE = {
     "focal": None,
     "calibration": None,
     "evidence": None,
+    "corrections": None,
+    "video": None,
 }
 #: Of a camera without telemetry and fixed points that moves.
 _BY_BODY = "; its camera moves as the body turns in its pictures"

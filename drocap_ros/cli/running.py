@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import threading
@@ -62,12 +63,37 @@ def interruptible(signals: Sequence[signal.Signals] = BOTH) -> Iterator[threadin
             signal.signal(number, handler)
 
 
+#: Value of the environment's ``DROCAP_PROGRESS`` with which progress is lines for a program: share, space, stage.
+PROGRESS_LINES = "lines"
+
+
+class _Shares:
+    """Completed share of work whose stages have known shares of its time, in their order."""
+
+    def __init__(self, shares: Mapping[str, float] | None) -> None:
+        self._shares, self._reached = shares or {}, 0.0
+
+    def __call__(self, stage: str, done: float) -> tuple[str, float]:
+        """The bar of a stage, one for all that have a share, and its completed share, negative where unknown."""
+        if stage not in self._shares:
+            return stage, done
+        names = list(self._shares)
+        before = sum(self._shares[name] for name in names[: names.index(stage)])
+        # Stages that run beside each other: the bar stays with the farthest.
+        self._reached = max(self._reached, before + self._shares[stage] * max(done, 0.0))
+        return "", self._reached / sum(self._shares.values()) if done >= 0 else -1.0
+
+
 @contextlib.contextmanager
 def progress_bars(quiet: bool = False, shares: Mapping[str, float] | None = None) -> Iterator[Progress]:
     """A callback that draws one bar per stage on stderr while the context lasts.
 
     shares : of the time that stages take, in their order: they have one bar together
     """
+    of_all = _Shares(shares)
+    if os.environ.get("DROCAP_PROGRESS") == PROGRESS_LINES:
+        yield lambda stage, done: print(f"{of_all(stage, done)[1]:.3f} {stage}", file=sys.stderr, flush=True)
+        return
     if quiet or not sys.stderr.isatty():
         yield lambda _stage, _done: None
         return
@@ -79,21 +105,11 @@ def progress_bars(quiet: bool = False, shares: Mapping[str, float] | None = None
     times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with Bars(*columns, *times, console=Console(stderr=True)) as bars:
         tasks: dict[str, TaskID] = {}
-        names = list(shares or {})
-
-        reached = 0.0
 
         def show(stage: str, done: float) -> None:
-            nonlocal reached
-            key, total = stage, None if done < 0 else 1.0
-            if shares and stage in shares:
-                before = sum(shares[name] for name in names[: names.index(stage)])
-                # Stages that run beside each other: the bar stays with the farthest.
-                key, done = "", max(reached, before + shares[stage] * max(done, 0.0))
-                reached = done
-                total = None if total is None else sum(shares.values())
+            key, share = of_all(stage, done)
             if key not in tasks:
                 tasks[key] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[key], description=stage, completed=done, total=total)
+            bars.update(tasks[key], description=stage, completed=max(share, 0.0), total=None if share < 0 else 1.0)
 
         yield show

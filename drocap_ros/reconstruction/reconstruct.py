@@ -18,7 +18,7 @@ from drocap_ros.reconstruction.balance import balanced
 from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
 from drocap_ros.reconstruction.camera.fusion import fuse_telemetry, with_causes
 from drocap_ros.reconstruction.camera.kinds import cut_times
-from drocap_ros.reconstruction.camera.picture_world import picture_camera, with_camera
+from drocap_ros.reconstruction.camera.picture_world import picture_camera, with_camera, with_vertical
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.engine import blas_threads
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
@@ -165,7 +165,7 @@ def body_poses(
     unknown = dataclasses.replace(camera, matrix=None) if camera.lens == "assumed" else camera
     found = picture_camera(unknown, tracks.background, tracks.image_size)
     if found is not None:
-        camera = _of_picture(camera, found)
+        camera = with_vertical(_of_picture(camera, found), tracks.vertical)
     elif attitude is not None:  # without a path the body stays at the origin
         return _solve(tracks, keypoints, camera, settings), camera
     poses = _solve(tracks, keypoints, as_seen(camera), settings)
@@ -221,6 +221,8 @@ def _solve(tracks: Tracks, keypoints: Keypoints2D, camera: CameraPath, settings:
         about = view or person_view(keypoints, camera.matrix, None, size)  # taken as in the middle
         data = dataclasses.replace(data, evidence=evidence if about is None else evidence.turned(about.turn))
     poses = run_method(settings.method, data)
+    if tracks.resting is not None:
+        poses = dataclasses.replace(poses, still=_as_said(tracks.resting, poses.still))
     if not np.isfinite(poses.joints_px).all(axis=(1, 2)).any():
         raise InputError("keypoints: expected those of a person, got none that give a finite pose; check the values")
     if view is None:
@@ -229,6 +231,11 @@ def _solve(tracks: Tracks, keypoints: Keypoints2D, camera: CameraPath, settings:
     if camera.points_tell_up and data.rotation is not None:
         poses = balanced(poses, data.rotation, tracks.stamp_ns)
     return view.in_image(poses)
+
+
+def _as_said(resting: np.ndarray, still: np.ndarray | None) -> np.ndarray:
+    """(F, 2) probability that a foot rests: as somebody says, else as the method does."""
+    return np.where(np.isfinite(resting), resting, 0.5 if still is None else still)
 
 
 def _motion(tracks: Tracks, keypoints: Keypoints2D, body: Body, settings: Settings) -> Motion:

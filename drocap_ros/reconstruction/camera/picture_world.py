@@ -67,6 +67,19 @@ def with_told(found: CameraPath, attitude: np.ndarray, errors: CameraErrors | No
     return replace(found, picture=picture)
 
 
+def with_vertical(found: CameraPath, vertical: np.ndarray | None) -> CameraPath:
+    """The picture's camera with the ends px of what is vertical in its images: (N, 5), index, lower and upper end."""
+    if vertical is None or found.matrix is None or found.rotation is None or found.picture is None:
+        return found
+    matrix = found.matrix
+    ray = (vertical[:, 1:].reshape(-1, 2, 2) - matrix[:2, 2]) / np.diagonal(matrix)[:2]
+    lower, upper = np.moveaxis(np.concatenate([ray, np.ones((*ray.shape[:2], 1))], axis=2), 1, 0)
+    normal = np.cross(lower, upper)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    turned = np.einsum("nji,nj->ni", found.rotation[vertical[:, 0].astype(int)], normal)
+    return replace(found, picture=replace(found.picture, lines=turned))
+
+
 def _by_points(camera: CameraPath, points: Background, size: tuple[int, int]) -> CameraPath:
     slot, fps = even_slots(camera.stamp_ns)
     seen = slot[points.frame], points.track, points.point.astype(np.float64)

@@ -1,7 +1,8 @@
 """Up, floor and metres of a camera's path that the picture alone gave: from the body, its feet and the ground's points.
 
 - Metres: the factor of the path at which feet rest while the camera moves, for a body of the assumed stature.
-- Up: the body's mean direction from feet to neck; then the plane of resting feet; then that of the points about it.
+- Up: the body's mean direction from feet to neck; then what is marked as vertical, the plane of resting feet, and that
+  of the points about it.
 """
 
 from __future__ import annotations
@@ -71,6 +72,8 @@ FEET_TELL = 0.05
 _LEVEL_STD_DEG = 3.0
 #: Standard deviation (degrees) of the body's mean direction from the vertical: people lean, and the lifter does.
 _BODY_STD_DEG = 3.0
+#: Standard deviation (degrees) of a wall's edge, or a door's, that is marked by two clicks.
+_LINE_STD_DEG = 1.0
 #: Angle (degrees) from the mean at which one frame's direction has half its weight.
 _LEANS_DEG = 15.0
 #: Standard deviation (m) of a resting foot's height, and independent ones per second: a foot rests for half a second.
@@ -131,6 +134,8 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
     source = UpSource.BODY
     if facts.told is not None and facts.told_std_deg < std_deg:
         up, std_deg, source = facts.told, facts.told_std_deg, UpSource.TOLD
+    plane = _by_lines(_Plane(up, 0.0, np.deg2rad(std_deg) ** 2 * np.eye(2)), facts.lines)
+    up, source = plane.up, UpSource.LINES if len(facts.lines) else source
     feet = from_camera[:, ANKLES]
     factor, factor_std, level, feet_tell = 1.0, float("nan"), None, False
     if np.ptp(position, axis=0).any():
@@ -143,7 +148,6 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
         )
     path, lying = factor * position, points * np.array([factor] * 3 + [1.0])
     feet = path[:, None] + feet
-    plane = _Plane(up, 0.0, np.deg2rad(std_deg) ** 2 * np.eye(2))
     by_feet = _by_feet(plane, feet, stamp_ns)
     # The tilt of feet on one line is known along it alone: half of the prior's variance stays.
     if np.trace(by_feet.covariance) < 0.75 * np.trace(plane.covariance):
@@ -151,6 +155,7 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
     plane = by_feet
     if level is not None and source is not UpSource.TOLD:
         begun = _Plane(level.up, factor * level.height + ANKLE_M, np.deg2rad(_LEVEL_STD_DEG) ** 2 * np.eye(2))
+        begun = _by_lines(begun, facts.lines)
         plane, source = _by_points(begun, feet, lying) or begun, UpSource.GROUND
     turn = _axes(plane.up, rotation[0])
     middle = feet.reshape(-1, 3).mean(axis=0)
@@ -237,6 +242,16 @@ def resting(feet: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
         rest[: len(stays)] = stays
         rest[lag:] = np.maximum(rest[lag:], stays)
     return rest
+
+
+def _by_lines(plane: _Plane, normals: np.ndarray) -> _Plane:
+    """The plane whose up lies in planes through the camera and something vertical, by their normals (N, 3)."""
+    if not len(normals):
+        return plane
+    rows = normals @ _two_across(plane.up).T
+    precision = np.linalg.inv(plane.covariance) + rows.T @ rows / np.deg2rad(_LINE_STD_DEG) ** 2
+    tilt = np.linalg.solve(precision, -rows.T @ (normals @ plane.up)) / np.deg2rad(_LINE_STD_DEG) ** 2
+    return _Plane(_unit(plane.up + tilt @ _two_across(plane.up)), plane.height, np.linalg.inv(precision))
 
 
 def _by_feet(prior: _Plane, feet: np.ndarray, stamp_ns: np.ndarray) -> _Plane:
