@@ -21,6 +21,7 @@ pytest_plugins = ["fixtures_export", "fixtures_recording", "fixtures_reconstruct
 #: Where nodes run, ports are listened to or time is measured, and what of it only computes.
 CLOCKED = (
     "nodes", "ros", "system", "view", "cli/test_live_cli.py", "cli/test_preflight_command.py",
+    "app/test_app_in_browser.py",
     "lab/commands/test_train_lifter.py", "flight/mavlink/test_link.py", "flight/mavlink/test_signing.py",
     "flight/mavlink/test_gimbal.py", "perception/sources/test_live_sources.py",
     "perception/models/test_fetch.py", "recording/mcap/test_bounded_queue.py",

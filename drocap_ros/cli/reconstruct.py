@@ -239,7 +239,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
                 telemetry=telemetry,
                 selection=selection,
             )
-            meta = {**motion.meta, "input": args.input.name, "command": args.command_line}
+            meta = {**motion.meta, "input": (args.video or args.input).name, "command": args.command_line}
             motion = dataclasses.replace(motion, meta=meta)
             write_outputs(out, names, motion, tracks, images.of)
     if not args.quiet:

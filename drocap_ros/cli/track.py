@@ -41,7 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("video", metavar="VIDEO", help="video file, image, folder of images, or recording with images")
     parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: VIDEO's name + _tracks)")
     parser.add_argument(
-        "--list", action="store_true", help="only find the persons, and write persons.jpg with their numbers"
+        "--list", action="store_true", help="only find the persons: persons.jpg has their numbers, person_N.jpg each"
     )
     add_all_option(parser, "tracks of each")
     add_clip_options(parser)
@@ -112,9 +112,10 @@ def _list(job: _Job) -> str:
 
     persons = persons_of(args.video, config, models, selection, progress)
     with open_images(args.video, config.image_ingest, args.topic) as images:
-        picture, begin_ns = persons_picture(images.frames, persons)
-    # Unlike imwrite, this raises the system's error: a full disk.
-    (target / "persons.jpg").write_bytes(cv2.imencode(".jpg", picture)[1].tobytes())
+        picture, each, begin_ns = persons_picture(images.frames, persons)
+    for name, image in {"persons": picture, **{f"person_{number}": image for number, image in each.items()}}.items():
+        # Unlike imwrite, this raises the system's error: a full disk.
+        (target / f"{name}.jpg").write_bytes(cv2.imencode(".jpg", image)[1].tobytes())
     lines = [
         f"person {p.number}: {(p.first_ns - begin_ns) * 1e-9:.1f} to {(p.last_ns - begin_ns) * 1e-9:.1f} s"
         for p in persons

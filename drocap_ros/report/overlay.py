@@ -242,11 +242,17 @@ def chosen_stamps(persons: Sequence[FoundPerson]) -> list[int]:
     return sorted(stamps)
 
 
-def persons_picture(frames: Iterable[Frame], persons: Sequence[FoundPerson]) -> tuple[np.ndarray, int]:
-    """(H, W, 3) uint8 BGR, images of :func:`chosen_stamps` with numbered boxes; the first frame's stamp, ns."""
+def persons_picture(
+    frames: Iterable[Frame], persons: Sequence[FoundPerson]
+) -> tuple[np.ndarray, dict[int, np.ndarray], int]:
+    """Pictures (H, W, 3) uint8 BGR of all and of each, and the first frame's stamp, ns.
+
+    The one of all has the images of :func:`chosen_stamps` with numbered boxes.
+    """
     import cv2
 
     wanted, tiles, begin_ns = chosen_stamps(persons), [], 0
+    each: dict[int, np.ndarray] = {}
     for number, frame in enumerate(frames):
         begin_ns = begin_ns if number else frame.stamp_ns
         if frame.stamp_ns not in wanted:
@@ -254,9 +260,11 @@ def persons_picture(frames: Iterable[Frame], persons: Sequence[FoundPerson]) -> 
         shrink = min(1.0, _WIDTH_PX / frame.image.shape[1])
         small = cv2.resize(frame.image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         boxes = {p.number: p.boxes[frame.stamp_ns] * shrink for p in persons if frame.stamp_ns in p.boxes}
+        for number, (x0, y0, x1, y1) in boxes.items():
+            each.setdefault(number, small[max(int(y0), 0) : int(y1) + 1, max(int(x0), 0) : int(x1) + 1].copy())
         tiles.append(draw_numbers(small, boxes, f"{(frame.stamp_ns - begin_ns) * 1e-9:.1f} s"))
         if frame.stamp_ns == wanted[-1]:
             break
     columns = int(np.ceil(np.sqrt(len(tiles))))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]), begin_ns
+    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]), each, begin_ns

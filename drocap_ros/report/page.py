@@ -332,6 +332,7 @@ def _provenance(motion: Motion, command: str) -> str:
     rows: list[tuple[str, object]] = [
         ("reconstructed by", meta.get("command")),
         ("report by", command),
+        ("corrected by hand", ", ".join(f"{kind}: {len(said)}" for kind, said in meta.get("corrections", {}).items())),
         ("git revision", meta.get("git_revision")),
         *(
             (f"{name} version", version)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from people_scenes import SIZE, PeopleScene, camera_of, images_of, of_another, people_of
+from people_scenes import PeopleScene, camera_of, of_another, people_of, write_video
 
 from drocap_ros.cli import main
 from drocap_ros.motion import load_motion
@@ -20,20 +19,9 @@ SCENE = PeopleScene("walk", 1, duration_s=2.4, rate_hz=12.5, distance_m=7.0, orb
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three who walk before a still camera, on ground with stones: what is rendered has hardly any texture."""
+    """Three who walk before a still camera."""
     path = tmp_path_factory.mktemp("people") / "three.avi"
-    people = people_of(SCENE)
-    ground = next(images_of(SCENE, people, ())).image
-    rng = np.random.default_rng(1)
-    stones = ground.copy()
-    for x, y in rng.integers((0, 0), SIZE, (400, 2)).tolist():
-        cv2.circle(stones, (x, y), 4, (0.8 * ground[y, x]).tolist(), -1)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), SCENE.rate_hz, (640, 360))
-    for frame in images_of(SCENE, people):
-        bare = (frame.image == ground).all(axis=2, keepdims=True)
-        image = np.where(bare, stones, frame.image)
-        writer.write(cv2.resize(image, (640, 360), interpolation=cv2.INTER_AREA))
-    writer.release()
+    write_video(path, SCENE)
     return path
 
 

@@ -76,8 +76,8 @@ class Browser:
         self._last = method
         return message
 
-    def open(self, path: Path, width: int, height: int, *, dark: bool = False) -> None:
-        """Load a file in a window of a size and wait until it is drawn."""
+    def open(self, page: Path | str, width: int, height: int, *, dark: bool = False) -> None:
+        """Load a file or an address in a window of a size and wait until it is drawn."""
         self.errors.clear()
         self.requests.clear()
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
@@ -85,7 +85,7 @@ class Browser:
         self.send(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
-        self.send("Page.navigate", url=path.as_uri())
+        self.send("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
         while self._last != "Page.loadEventFired":
             self._receive()
         self.settle()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from drocap_ros.perception.sources.base import Frame
@@ -156,3 +158,19 @@ def of_another(keypoints: np.ndarray, truth: Sequence[np.ndarray], who: int) -> 
     others = np.min([off(person) for k, person in enumerate(truth) if k != who], axis=0)
     found: np.ndarray = (others < _ON_OTHER) & (off(own) > _OFF_OWN)
     return found
+
+
+def write_video(path: Path, scene: PeopleScene) -> None:
+    """An .avi of a scene, 640x360, on ground with stones: what is rendered has hardly any texture."""
+    people = people_of(scene)
+    ground = next(images_of(scene, people, ())).image
+    rng = np.random.default_rng(1)
+    stones = ground.copy()
+    for x, y in rng.integers((0, 0), SIZE, (400, 2)).tolist():
+        cv2.circle(stones, (x, y), 4, (0.8 * ground[y, x]).tolist(), -1)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), scene.rate_hz, (640, 360))
+    for frame in images_of(scene, people):
+        bare = (frame.image == ground).all(axis=2, keepdims=True)
+        image = np.where(bare, stones, frame.image)
+        writer.write(cv2.resize(image, (640, 360), interpolation=cv2.INTER_AREA))
+    writer.release()

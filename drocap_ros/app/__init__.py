@@ -1,0 +1,1 @@
+"""``drocap app``: one page in a browser for clips, corrections and exports; every answer is a command's."""

@@ -1,0 +1,407 @@
+"""Corrections by hand: the clip with its keypoints, a timeline of the feet, and the solution again."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+from nicegui import events, ui
+
+from drocap_ros.app.jobs import Job
+from drocap_ros.contacts import rest_spans
+from drocap_ros.corrections import parse_corrections, save_corrections
+from drocap_ros.skeleton import COLOURS, joint_set_of, side_of
+
+if TYPE_CHECKING:
+    from drocap_ros.app.library import Entry
+    from drocap_ros.app.page import Page
+
+#: Width of the timeline, height of each of its three rows, and a click's most movement on it, px.
+_WIDTH, _ROW, _CLICK = 1000.0, 28.0, 6.0
+_FEET = ("left", "right")
+#: Size of a drawn joint over the picture's longer side, and distance of a click that takes it, in such sizes.
+_JOINT, _REACH = 1 / 110, 3.0
+
+
+def rgb(colour: tuple[int, int, int]) -> str:
+    """A colour as SVG writes it."""
+    return f"rgb{colour}"
+
+
+class Correct:
+    """The part of the page that corrects a motion."""
+
+    def __init__(self, page: Page, entry: Entry) -> None:
+        self._page, self._entry = page, entry
+        self._pictures = page.desk.open_pictures(entry)
+        self._said: dict[str, list[Any]] = {kind: list(rows) for kind, rows in entry.corrections().items()}
+        self._index = 0
+        self._range: tuple[int, int] | None = None
+        self._joint: int | None = None
+        self._drag: int | None = None
+        self._mode, self._ends = "", list[tuple[float, float]]()
+        self._from: tuple[float, int] | None = None  # where the mouse went down on the timeline, and its row
+        self._read()
+        self._build()
+        self._draw()
+
+    def close(self) -> None:
+        """The page shows something else."""
+        self._page.desk.close_pictures(self._entry)
+
+    def _read(self) -> None:
+        """What is shown of the motion as it is solved now."""
+        self._motion, self._tracks = self._entry.motion, self._entry.tracks
+        stamp_ns = self._motion.stamp_ns
+        self._seconds = (stamp_ns - stamp_ns[0]) * 1e-9
+        rate = 1.0 / max(float(np.median(np.diff(self._seconds))), 1e-3) if len(stamp_ns) > 1 else 30.0
+        ankles = [self._motion.joints.index(f"{side[0]}ankle") for side in _FEET]
+        in_world = self._motion.frame == "world"
+        self._rests = [rest_spans(self._motion.joints3d[:, a], rate) if in_world else [] for a in ankles]
+        source, place = joint_set_of(self._tracks.joints)
+        bones = [(int(place[a]), int(place[b])) for a, b in source.bones]
+        self._bones = [(a, b) for a, b in bones if a >= 0 and b >= 0]
+        self._change()
+
+    def _change(self) -> None:
+        """Apply what is said to the keypoints that are shown; other persons are as the last solution found them."""
+        self._meant = self._entry.corrected(self._said).keypoints
+        for span, box in parse_corrections(self._said).person:
+            rows = span.of(self._seconds)
+            self._meant[rows] = np.nan
+            for joint, name in enumerate(self._tracks.joints if box is not None else ()):
+                if name in self._motion.joints:
+                    self._meant[rows, joint] = self._motion.keypoints[rows, self._motion.joints.index(name)]
+
+    def _build(self) -> None:
+        with ui.row().classes("w-full items-center gap-2"):
+            self._close = ui.switch("Close up", value=True, on_change=self._draw)
+            self._name = ui.select(
+                dict(enumerate(self._tracks.joints)), label="Joint", on_change=self._choose_joint
+            ).classes("w-40")
+            tools = (
+                ("Not seen", self._hide, "the chosen joint is not seen in the range"),
+                ("Exchange legs", lambda: self._exchange("legs"), "left and right below the hips, in the range"),
+                ("Exchange arms", lambda: self._exchange("arms"), "left and right below the shoulders, in the range"),
+                ("Exchange all", lambda: self._exchange("all"), "left and right of the body, in the range"),
+                ("Another person", lambda: self._begin("person"), "draw a box about who is meant, from here on"),
+                ("Nobody", self._nobody, "the person is not in the picture, in the range"),
+                ("Vertical", lambda: self._begin("upright"), "click the lower, then the upper end of an edge"),
+            )
+            for label, action, words in tools:
+                ui.button(label, on_click=action).props("outline dense no-caps").tooltip(words)
+        self._hint = ui.label().classes("text-sm opacity-80")
+        self._picture = ui.interactive_image(
+            on_mouse=self._mouse, events=["mousedown", "mousemove", "mouseup"], sanitize=False
+        )
+        self._picture.props('data-part="picture"')
+        self._timeline = ui.interactive_image(
+            size=(_WIDTH, 3 * _ROW), on_mouse=self._time_mouse, events=["mousedown", "mouseup"], sanitize=False
+        )
+        self._timeline.classes("w-full").props('data-part="timeline"')
+        with ui.row().classes("items-center"):
+            ui.button(icon="chevron_left", on_click=lambda: self._go(self._index - 1)).props("flat dense")
+            self._at = ui.label().classes("font-mono")
+            ui.button(icon="chevron_right", on_click=lambda: self._go(self._index + 1)).props("flat dense")
+            ui.button("Solve again", on_click=self._solve)
+            ui.label("Arrow keys: an image, with Shift ten; [ and ] begin and end a range.").classes(
+                "text-xs opacity-70"
+            )
+        self._list = ui.column().classes("gap-0")
+        ui.keyboard(on_key=self._key)
+        self._waiting = ui.timer(0.3, self._wait)
+
+    def _wait(self) -> None:
+        """Until the picture has been read."""
+        if self._pictures.read > self._index or self._pictures.error:
+            self._waiting.deactivate()
+            self._draw()
+
+    # Drawing
+
+    def _draw(self) -> None:
+        """Everything as it is now."""
+        pictures, close = self._pictures, bool(self._close.value)
+        if pictures.error:
+            self._hint.text, (width, height) = pictures.error, pictures.size
+            blank = f"<svg xmlns='http://www.w3.org/2000/svg' width='{width}' height='{height}'/>"
+            self._picture.set_source(f"data:image/svg+xml,{quote(blank)}")
+        elif pictures.read > self._index:
+            key = self._page.desk.key(self._entry)
+            self._picture.set_source(f"/library/{key}/frame/{self._index}?close={int(close)}")
+        else:
+            self._waiting.activate()
+        x0, y0, x1, y1 = pictures.boxes[self._index] if close else (0, 0, *pictures.size)
+        self._picture.style(f"width: min(100%, {60 * (x1 - x0) / max(y1 - y0, 1):.1f}vh)")
+        self._picture.set_content(self._skeleton())
+        self._timeline.set_content(self._bars())
+        span = (
+            ""
+            if self._range is None
+            else f"  range {self._time(self._range[0]):.2f} to {self._time(self._range[1]):.2f} s"
+        )
+        self._at.text = f"{self._seconds[self._index]:.2f} s, image {self._index}{span}"
+        self._show_list()
+
+    def _view(self) -> tuple[np.ndarray, float]:
+        return self._pictures.shown(self._index, bool(self._close.value) and not self._pictures.error)
+
+    def _skeleton(self) -> str:
+        (corner, scale), keypoints = self._view(), self._meant[self._index]
+        at = (keypoints - corner) * scale
+        x0, y0, x1, y1 = self._pictures.boxes[self._index]
+        longer = max(x1 - x0, y1 - y0) if self._close.value else max(self._pictures.size)
+        r = longer * scale * _JOINT
+        out = []
+        for a, b in self._bones:
+            if np.isfinite(at[[a, b]]).all():
+                (ax, ay), (bx, by) = at[a], at[b]
+                colour = rgb(COLOURS[side_of(self._tracks.joints[b], self._tracks.joints)])
+                out.append(
+                    f'<line x1="{ax:.1f}" y1="{ay:.1f}" x2="{bx:.1f}" y2="{by:.1f}" stroke="{colour}"'
+                    f' stroke-width="{0.5 * r:.1f}" stroke-opacity="0.8"/>'
+                )
+        placed = {entry["joint"] for entry in self._said.get("joints", []) if self._image(entry["time"]) == self._index}
+        for joint, (name, (x, y)) in enumerate(zip(self._tracks.joints, at, strict=True)):
+            if np.isfinite([x, y]).all():
+                colour = rgb(COLOURS[side_of(name, self._tracks.joints)])
+                ring = "yellow" if joint == self._joint else "white" if name in placed else "none"
+                out.append(
+                    f'<circle data-joint="{name}" cx="{x:.1f}" cy="{y:.1f}" r="{r:.1f}" fill="{colour}"'
+                    f' stroke="{ring}" stroke-width="{0.5 * r:.1f}"><title>{name}</title></circle>'
+                )
+        ends = [(np.array(end) - corner) * scale for end in self._ends]
+        if self._mode == "person" and len(ends) == 2:
+            (ax, ay), (bx, by) = np.minimum(*ends), np.maximum(*ends)
+            out.append(
+                f'<rect x="{ax:.1f}" y="{ay:.1f}" width="{bx - ax:.1f}" height="{by - ay:.1f}" fill="none"'
+                f' stroke="yellow" stroke-width="{0.5 * r:.1f}"/>'
+            )
+        out += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{r:.1f}" fill="yellow"/>' for x, y in ends]
+        return "".join(out)
+
+    def _bars(self) -> str:
+        """The timeline: images and the range, then the rests of each foot, and what is said of them."""
+        out = [f'<rect width="{_WIDTH}" height="{3 * _ROW}" fill="#8882"/>']
+        if self._range is not None:
+            a, b = (self._x(i) for i in self._range)
+            out.append(f'<rect x="{a:.1f}" width="{max(b - a, 2):.1f}" height="{_ROW}" fill="#fc08"/>')
+        for kind in ("joints", "hidden", "sides", "person", "upright"):
+            for entry in self._said.get(kind, []):
+                a = self._x(self._image(entry.get("time", entry.get("from", 0.0))))
+                b = self._x(self._image(entry.get("time", entry.get("to", self._seconds[-1]))))
+                out.append(f'<rect x="{a:.1f}" y="{_ROW - 6}" width="{max(b - a, 3):.1f}" height="6" fill="#e80"/>')
+        for row, (foot, spans) in enumerate(zip(_FEET, self._rests, strict=True), start=1):
+            colour = rgb(COLOURS[foot])
+            for a, b in spans:
+                out.append(self._bar(row, a, b - 1, f'fill="{colour}" fill-opacity="0.6"'))
+            for entry in self._said.get("feet", []):
+                if entry["foot"] == foot:
+                    a, b = (self._image(entry[end]) for end in ("from", "to"))
+                    fill = "#2a2" if entry["rests"] else "#c33"
+                    out.append(self._bar(row, a, b, f'fill="{fill}" stroke="white"'))
+            out.append(f'<text x="4" y="{_ROW * (row + 0.7)}" font-size="13" fill="currentColor">{foot} foot</text>')
+        x = self._x(self._index)
+        out.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="{3 * _ROW}" stroke="currentColor" stroke-width="2"/>')
+        return "".join(out)
+
+    def _bar(self, row: int, first: int, last: int, style: str) -> str:
+        a, b = self._x(first), self._x(last)
+        return f'<rect x="{a:.1f}" y="{_ROW * row + 4}" width="{max(b - a, 3):.1f}" height="{_ROW - 8}" {style}/>'
+
+    def _show_list(self) -> None:
+        self._list.clear()
+        with self._list:
+            for kind, entries in self._said.items():
+                for entry in entries:
+                    words = ", ".join(f"{key} {value}" for key, value in entry.items())
+                    with ui.row().classes("items-center gap-1"):
+                        ui.button(icon="close", on_click=lambda k=kind, e=entry: self._remove(k, e)).props(
+                            f'flat dense size=sm aria-label="remove {escape(kind)}"'
+                        )
+                        ui.label(f"{kind}: {words}").classes("text-sm")
+
+    # Times
+
+    def _time(self, index: int) -> float:
+        return round(float(self._seconds[index]), 4)
+
+    def _image(self, seconds: float) -> int:
+        return int(np.argmin(np.abs(self._seconds - seconds)))
+
+    def _x(self, index: int) -> float:
+        return _WIDTH * index / max(len(self._seconds) - 1, 1)
+
+    def _at_x(self, x: float) -> int:
+        return int(np.clip(round(x / _WIDTH * (len(self._seconds) - 1)), 0, len(self._seconds) - 1))
+
+    def _go(self, index: int) -> None:
+        self._index = int(np.clip(index, 0, len(self._seconds) - 1))
+        self._draw()
+
+    def _span(self) -> dict[str, float]:
+        """The range, or the image that is shown."""
+        first, last = self._range or (self._index, self._index)
+        return {"from": self._time(first), "to": self._time(last)}
+
+    # What is said
+
+    def _say(self, kind: str, entry: dict[str, Any]) -> None:
+        self._said.setdefault(kind, []).append(entry)
+        self._change()
+        self._draw()
+
+    def _remove(self, kind: str, entry: dict[str, Any]) -> None:
+        self._said[kind].remove(entry)
+        self._change()
+        self._draw()
+
+    def _place(self, joint: int, at: np.ndarray) -> None:
+        name, time_s = self._tracks.joints[joint], self._time(self._index)
+        kept = [e for e in self._said.get("joints", []) if (e["joint"], self._image(e["time"])) != (name, self._index)]
+        self._said["joints"] = kept
+        self._say("joints", {"time": time_s, "joint": name, "at": [round(float(v), 2) for v in at]})
+
+    def _choose_joint(self) -> None:
+        self._joint = self._name.value
+        seen = self._joint is not None and np.isfinite(self._meant[self._index, self._joint]).all()
+        self._hint.text = "" if seen or self._joint is None else "click in the picture where this joint is"
+        self._draw()
+
+    def _hide(self) -> None:
+        if self._joint is None:
+            self._hint.text = "choose a joint first: click it, or by its name"
+            return
+        self._say("hidden", {**self._span(), "joint": self._tracks.joints[self._joint]})
+
+    def _exchange(self, limbs: str) -> None:
+        self._say("sides", {**self._span(), "limbs": limbs})
+
+    def _nobody(self) -> None:
+        self._say("person", self._span())
+
+    def _begin(self, mode: str) -> None:
+        """The next clicks in the whole picture mean something else."""
+        self._mode, self._ends = mode, []
+        if mode == "person" and self._range is not None:
+            self._index = self._range[0]
+        self._hint.text = {
+            "person": "draw a box about the person who is meant",
+            "upright": "click the lower end of something vertical, then its upper end",
+        }[mode]
+        self._close.set_value(False)
+        self._draw()
+
+    # The mouse and keys
+
+    def _mouse(self, event: events.MouseEventArguments) -> None:
+        corner, scale = self._view()
+        at = np.array([event.image_x, event.image_y]) / scale + corner
+        if self._mode:
+            self._mouse_of_mode(event.type, (float(at[0]), float(at[1])))
+        elif event.type == "mousedown":
+            self._drag = self._near(at)
+            if self._drag is not None:
+                self._joint = self._drag
+                self._name.set_value(self._drag)
+            elif self._joint is not None and np.isnan(self._meant[self._index, self._joint]).any():
+                self._place(self._joint, at)
+        elif self._drag is not None and event.type == "mousemove" and event.buttons & 1:
+            self._meant[self._index, self._drag] = at
+            self._picture.set_content(self._skeleton())
+        elif self._drag is not None and event.type == "mouseup":
+            joint, self._drag = self._drag, None
+            before = self._entry.corrected(self._said).keypoints[self._index, joint]
+            if not np.linalg.norm(at - before) < 0.5:
+                self._place(joint, at)
+
+    def _near(self, at: np.ndarray) -> int | None:
+        """The joint that a click takes."""
+        x0, y0, x1, y1 = self._pictures.boxes[self._index]
+        longer = max(x1 - x0, y1 - y0) if self._close.value else max(self._pictures.size)
+        away = np.linalg.norm(self._meant[self._index] - at, axis=1)
+        if not np.isfinite(away).any() or np.nanmin(away) > _REACH * _JOINT * longer:
+            return None
+        return int(np.nanargmin(away))
+
+    def _mouse_of_mode(self, kind: str, at: tuple[float, float]) -> None:
+        if self._mode == "upright":
+            if kind == "mousedown":
+                self._ends.append(at)
+            if len(self._ends) == 2:
+                (lower, upper), self._ends = sorted(self._ends, key=lambda end: -end[1]), []
+                self._end_mode("upright", {"time": self._time(self._index), "bottom": _px(lower), "top": _px(upper)})
+                return
+        elif kind == "mousedown":
+            self._ends = [at, at]
+        elif self._ends:
+            self._ends[1] = at
+            if kind == "mouseup":
+                low, high = np.array(self._ends).min(axis=0), np.array(self._ends).max(axis=0)
+                if (high - low).min() > 8:
+                    entry: dict[str, Any] = {"from": self._time(self._index), "box": _px((*low, *high))}
+                    entry |= {} if self._range is None else {"to": self._time(self._range[1])}
+                    self._end_mode("person", entry)
+                    return
+        self._picture.set_content(self._skeleton())
+
+    def _end_mode(self, kind: str, entry: dict[str, Any]) -> None:
+        self._mode, self._ends, self._hint.text = "", [], ""
+        self._say(kind, entry)
+
+    def _time_mouse(self, event: events.MouseEventArguments) -> None:
+        row = int(np.clip(event.image_y // _ROW, 0, 2))
+        if event.type == "mousedown":
+            self._from = (event.image_x, row)
+            return
+        if self._from is None:
+            return
+        (begin, row), self._from = self._from, None
+        first, last = sorted((self._at_x(begin), self._at_x(event.image_x)))
+        dragged = abs(event.image_x - begin) > _CLICK
+        if row == 0:
+            self._range = (first, last) if dragged else None
+            self._go(first)
+        else:
+            self._foot(_FEET[row - 1], first, last if dragged else None)
+
+    def _foot(self, foot: str, first: int, last: int | None) -> None:
+        """A drag says that a foot rests; a click on a rest that it does not, on what is said that it is not said."""
+        if last is not None:
+            self._say("feet", {"from": self._time(first), "to": self._time(last), "foot": foot, "rests": True})
+            return
+        for entry in self._said.get("feet", []):
+            if entry["foot"] == foot and entry["from"] <= self._seconds[first] <= entry["to"]:
+                self._remove("feet", entry)
+                return
+        for a, b in self._rests[_FEET.index(foot)]:
+            if a <= first < b:
+                self._say("feet", {"from": self._time(a), "to": self._time(b - 1), "foot": foot, "rests": False})
+                return
+        self._go(first)
+
+    def _key(self, event: events.KeyEventArguments) -> None:
+        if not event.action.keydown:
+            return
+        step = 10 if event.modifiers.shift else 1
+        if event.key.arrow_left or event.key.arrow_right:
+            self._go(self._index + (step if event.key.arrow_right else -step))
+        elif event.key.name in ("[", "]"):
+            first, last = self._range or (self._index, self._index)
+            begin, end = (self._index, last) if event.key.name == "[" else (first, self._index)
+            self._range = (min(begin, end), max(begin, end))
+            self._draw()
+
+    async def _solve(self) -> None:
+        """Write the file and solve the motion again from its tracks."""
+        save_corrections(self._entry.corrections_file, self._said)
+        if await self._page.work(Job(self._entry.words(self._page.desk.models))):
+            self._read()
+            self._draw()
+            self._page.solved()
+
+
+def _px(values: tuple[float, ...]) -> list[float]:
+    return [round(float(v), 1) for v in values]

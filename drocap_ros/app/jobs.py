@@ -1,0 +1,63 @@
+"""Commands of ``drocap`` that run beside the page, with progress and cancel."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shlex
+import signal
+import sys
+from dataclasses import dataclass, field
+
+#: Lines of a command's output that are kept.
+_MOST_LINES = 200
+
+
+@dataclass
+class Job:
+    """One command line; ``status`` is None while it waits or runs, then its exit status.
+
+    share : of its work that is done, negative while unknown
+    lines : what it said
+    """
+
+    words: list[str]
+    stage: str = ""
+    share: float = -1.0
+    lines: list[str] = field(default_factory=list)
+    status: int | None = None
+    _process: asyncio.subprocess.Process | None = None
+
+    @property
+    def command(self) -> str:
+        """The command as a shell takes it."""
+        return shlex.join(["drocap", *self.words])
+
+    async def run(self) -> int:
+        """Run to the end; returns the exit status.  A command that is cancelled leaves no half-written file."""
+        self._process = process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "drocap_ros.cli", *self.words),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            env={**os.environ, "DROCAP_PROGRESS": "lines"},
+        )
+        assert process.stdout is not None
+        assert process.stderr is not None
+        await asyncio.gather(self._read(process.stdout), self._read(process.stderr))
+        self.status = await process.wait()
+        return self.status
+
+    async def _read(self, stream: asyncio.StreamReader) -> None:
+        async for raw in stream:
+            line = raw.decode(errors="replace").rstrip()
+            number, _, stage = line.partition(" ")
+            try:
+                self.share, self.stage = float(number), stage
+            except ValueError:
+                self.lines = [*self.lines, line][-_MOST_LINES:]
+
+    def cancel(self) -> None:
+        """Interrupt it as Ctrl-C does."""
+        if self._process is not None and self.status is None:
+            self._process.send_signal(signal.SIGTERM)

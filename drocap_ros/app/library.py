@@ -1,0 +1,196 @@
+"""What a folder holds: clips, and motions with their videos, images and corrections."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import shlex
+import tempfile
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drocap_ros.corrections import FILE as CORRECTIONS
+from drocap_ros.corrections import corrected, load_corrections, parse_corrections
+from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.file_kind import FileKind, file_kind
+from drocap_ros.motion import FILE, Motion, load_motion
+from drocap_ros.parameters import Values
+from drocap_ros.report.checks import quality_sentence, run_checks
+from drocap_ros.report.motion_images import FollowingBox, each_image
+from drocap_ros.report.page import images_of_page
+from drocap_ros.report.statistics import motion_statistics
+from drocap_ros.tracks import Tracks, load_tracks
+
+logger = logging.getLogger(__name__)
+
+#: Longer side (px) of the pictures of a clip that is corrected.
+_LONG_SIDE = 1600
+#: Most pictures that are kept on the disk for one clip: ten minutes at 30 Hz.
+_MOST_PICTURES = 18_000
+
+
+def clips(folder: Path) -> list[Path]:
+    """Videos of a folder, by their names."""
+    files = (path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith("."))
+    return [path for path in files if file_kind(path) is FileKind.VIDEO]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A motion of the library; ``folder`` holds it, ``name`` is its path below the library."""
+
+    folder: Path
+    name: str
+
+    @property
+    def motion(self) -> Motion:
+        """The motion as it is now."""
+        return _motion(self.folder / FILE, (self.folder / FILE).stat().st_mtime_ns)
+
+    @property
+    def tracks(self) -> Tracks:
+        """Its tracks before corrections."""
+        return load_tracks(self.folder / "tracks.npz")
+
+    @property
+    def report(self) -> Path:
+        """Its page; of one of several persons that of all."""
+        own = self.folder / "report.html"
+        return own if own.exists() else self.folder.parent / "report.html"
+
+    @property
+    def quality(self) -> str:
+        """The sentence of the summary."""
+        return _quality(self.folder / FILE, (self.folder / FILE).stat().st_mtime_ns)
+
+    @property
+    def thumbnail(self) -> bytes | None:
+        """A JPEG of its middle; None = the report has no images."""
+        images = images_of_page(self.folder / "report.html", self.motion)
+        return images.jpegs[len(images.jpegs) // 2] if images else None
+
+    @property
+    def video(self) -> Path | None:
+        """The clip that it was made from, where it can be found: as the command named it, or beside the motion."""
+        words = shlex.split(str(self.motion.meta.get("command", "")))
+        name = str(self.motion.meta.get("input", ""))
+        beside = [parent / name for parent in (self.folder, *self.folder.parents[:3]) if name]
+        named = [Path(word) for word in words if Path(word).name == name]
+        usable = (path for path in (*named, *beside) if path.exists() and path.suffix != ".npz")
+        return next(usable, None)
+
+    @property
+    def corrections_file(self) -> Path:
+        """It need not exist."""
+        return self.folder / CORRECTIONS
+
+    def corrections(self) -> Values:
+        """The entries of the file; none without one."""
+        return dict(load_corrections(self.corrections_file).values) if self.corrections_file.exists() else {}
+
+    def corrected(self, corrections: Values) -> Tracks:
+        """The tracks as they are meant, but for other persons, whom only the solution looks for."""
+        return corrected(self.tracks, parse_corrections({**corrections, "person": []}))
+
+    def words(self, models: Path | None) -> list[str]:
+        """The command that solves it again, from its tracks and its corrections, with the options it had."""
+        words = ["reconstruct", str(self.folder / "tracks.npz"), "--out", str(self.folder)]
+        words += ["--video", str(self.video)] if self.video else []
+        words += ["--corrections", str(self.corrections_file)] if self.corrections_file.exists() else []
+        words += ["--models", str(models)] if models else []
+        given = shlex.split(str(self.motion.meta.get("command", "")))
+        for option in ("--height", "--method", "--config", "--dictionary"):
+            for at, word in enumerate(given):
+                if word == option and at + 1 < len(given):
+                    words += [option, given[at + 1]]
+                elif word.startswith(f"{option}="):
+                    words += [word]
+        return words
+
+
+def motions(folder: Path) -> Iterator[Entry]:
+    """Motions in the folders of a folder, those of several persons one by one; the newest first."""
+    files = [path for pattern in (f"*/{FILE}", f"*/person_*/{FILE}") for path in folder.glob(pattern)]
+    for path in sorted(files, key=lambda path: (-path.stat().st_mtime_ns, path)):
+        entry = Entry(path.parent, str(path.parent.relative_to(folder)))
+        try:
+            logger.debug("%s: %s", entry.name, entry.quality)
+        except DrocapError as error:
+            logger.warning("%s", error)
+            continue
+        yield entry
+
+
+@functools.lru_cache(maxsize=8)
+def _motion(path: Path, _changed_ns: int) -> Motion:
+    return load_motion(path)
+
+
+@functools.lru_cache(maxsize=1000)
+def _quality(path: Path, changed_ns: int) -> str:
+    motion = _motion(path, changed_ns)
+    return quality_sentence(run_checks(motion, motion_statistics(motion)))
+
+
+class Pictures:
+    """The images of a motion as JPEG files, read in a thread of its own, whole and as crops about the person."""
+
+    def __init__(self, entry: Entry) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="drocap_app_")
+        self._stop, self.read, self.error = threading.Event(), 0, ""
+        motion, self._boxes = entry.motion, FollowingBox()
+        self.scale, self.size = 1.0, entry.tracks.image_size
+        self.boxes: list[tuple[int, int, int, int]] = [
+            self._boxes(int(stamp_ns), keypoints, self.size[::-1])
+            for stamp_ns, keypoints in zip(motion.stamp_ns, motion.keypoints, strict=True)
+        ]
+        self._thread = threading.Thread(target=self._fill, args=(entry.video, motion), daemon=True)
+        self._thread.start()
+
+    def _fill(self, video: Path | None, motion: Motion) -> None:
+        import cv2
+
+        if video is None:
+            self.error = "the video of this motion is not found beside it"
+            return
+        try:
+            for index, image in each_image(video, motion):
+                if self._stop.is_set() or self.read >= _MOST_PICTURES:
+                    return
+                shrink = min(1.0, _LONG_SIDE / max(image.shape[:2]))
+                small = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+                jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+                self.scale = shrink
+                (Path(self._folder.name) / f"{index}.jpg").write_bytes(jpeg.tobytes())
+                self.read = index + 1
+        except (InputError, OSError) as error:
+            self.error = str(error)
+
+    def jpeg(self, index: int, close: bool) -> bytes | None:
+        """An image, or the part about the person; None = it is not read yet, or there is none."""
+        import cv2
+
+        path = Path(self._folder.name) / f"{index}.jpg"
+        if not path.exists():
+            return None
+        if not close:
+            return path.read_bytes()
+        image = cv2.imread(str(path))
+        if image is None:
+            return None
+        x0, y0, x1, y1 = (round(self.scale * v) for v in self.boxes[index])
+        return bytes(cv2.imencode(".jpg", image[y0:y1, x0:x1])[1].tobytes())
+
+    def shown(self, index: int, close: bool) -> tuple[np.ndarray, float]:
+        """(2,) px of the image's corner in the clip, and px of the picture per px of the clip."""
+        return np.array(self.boxes[index][:2] if close else (0, 0), float), self.scale
+
+    def close(self) -> None:
+        """End the thread and remove the files."""
+        self._stop.set()
+        self._thread.join(timeout=10.0)
+        self._folder.cleanup()

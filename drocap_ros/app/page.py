@@ -1,0 +1,237 @@
+"""The page: clips, the library, and of the chosen motion the report, its corrections and exports."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from nicegui import app, ui
+from starlette.responses import FileResponse, HTMLResponse, Response
+
+from drocap_ros.app.clips import Clips
+from drocap_ros.app.correct import Correct
+from drocap_ros.app.exports import Exports
+from drocap_ros.app.jobs import Job
+from drocap_ros.app.library import Entry, Pictures, motions
+from drocap_ros.errors import DrocapError
+
+
+class Desk:
+    """What all pages of one server share: the folder, the networks, pictures of the clips that are corrected."""
+
+    def __init__(self, folder: Path, models: Path | None) -> None:
+        self.folder, self.models = folder, models
+        self._entries: dict[str, Entry] = {}
+        self._pictures: dict[str, tuple[Pictures, int]] = {}
+        app.get("/library/{key}/report")(self._report)
+        app.get("/library/{key}/thumbnail")(self._thumbnail)
+        app.get("/library/{key}/frame/{index}")(self._frame)
+        app.on_shutdown(self.close)
+
+    def key(self, entry: Entry) -> str:
+        """The name of an entry in addresses."""
+        key = hashlib.sha256(entry.name.encode()).hexdigest()[:16]
+        self._entries[key] = entry
+        return key
+
+    def _entry(self, key: str) -> Entry | None:
+        return self._entries.get(key)
+
+    def _report(self, key: str) -> Response:
+        entry = self._entry(key)
+        if entry is None or not entry.report.exists():
+            return HTMLResponse("<p>no report: it was left out</p>", status_code=404)
+        return FileResponse(entry.report, media_type="text/html", headers={"Cache-Control": "no-store"})
+
+    def _thumbnail(self, key: str) -> Response:
+        entry = self._entry(key)
+        jpeg = entry.thumbnail if entry else None
+        return Response(jpeg, media_type="image/jpeg") if jpeg else Response(status_code=404)
+
+    def _frame(self, key: str, index: int, close: int = 0) -> Response:
+        entry = self._entry(key)
+        shown = self._pictures.get(key)
+        jpeg = shown[0].jpeg(index, bool(close)) if entry and shown else None
+        return Response(jpeg, media_type="image/jpeg") if jpeg else Response(status_code=404)
+
+    def open_pictures(self, entry: Entry) -> Pictures:
+        """The pictures of a clip, shared by all pages that show it, until each has closed them."""
+        key = self.key(entry)
+        pictures, users = self._pictures.get(key) or (Pictures(entry), 0)
+        self._pictures[key] = pictures, users + 1
+        return pictures
+
+    def close_pictures(self, entry: Entry) -> None:
+        """A page shows them no more."""
+        key = self.key(entry)
+        if key in self._pictures:
+            pictures, users = self._pictures.pop(key)
+            if users > 1:
+                self._pictures[key] = pictures, users - 1
+            else:
+                pictures.close()
+
+    def close(self) -> None:
+        """Remove what was kept for the pages."""
+        for pictures, _ in self._pictures.values():
+            pictures.close()
+        self._pictures.clear()
+
+
+class Page:
+    """One browser's page."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk = desk
+        self.entry: Entry | None = None
+        self._shown: list[Callable[[], None]] = []
+        ui.add_css(_STYLE)
+        with ui.header().classes("items-center justify-between py-1"):
+            ui.label("drocap").classes("text-lg font-bold")
+            ui.label(str(desk.folder)).classes("text-sm opacity-80")
+            self._dark = ui.dark_mode(None)
+            ui.button(icon="contrast", on_click=self._dark.toggle).props("flat round dense color=white").tooltip(
+                "light or dark"
+            )
+        with ui.element("div").classes("desk"):
+            with ui.column().classes("side"):
+                self._clips = Clips(self)
+                ui.label("Motions").classes("text-base font-bold")
+                self._library = ui.column().classes("w-full gap-2").props('role=list aria-label="motions"')
+                self._said = ui.label().classes("said").props('aria-live=polite data-part="said"')
+            self._main = ui.column().classes("main")
+        ui.context.client.on_delete(self._leave)
+        self.refresh()
+        first = next(iter(motions(desk.folder)), None)
+        if first is not None:
+            self.choose(first)
+        else:
+            with self._main:
+                ui.label("Drop a video, or choose one, and press Reconstruct.").classes("text-base opacity-80 p-8")
+
+    def show_newest(self) -> None:
+        """A motion was made."""
+        self.choose(next(motions(self.desk.folder)))
+
+    def refresh(self) -> None:
+        """Show the library as the folder is now."""
+        self._library.clear()
+        with self._library:
+            for entry in motions(self.desk.folder):
+                self._card(entry)
+
+    def _card(self, entry: Entry) -> None:
+        key, chosen = self.desk.key(entry), self.entry is not None and entry.name == self.entry.name
+        card = ui.card().classes("w-full p-2 cursor-pointer" + (" chosen" if chosen else ""))
+        card.props(f'tabindex=0 role=listitem data-motion="{entry.name}"')
+        for event in ("click", "keydown.enter"):
+            card.on(event, lambda entry=entry: self.choose(entry))
+        with card, ui.row().classes("items-center no-wrap w-full"):
+            ui.html(f'<img class="thumb" alt="" src="/library/{key}/thumbnail?{secrets.token_hex(4)}">', sanitize=False)
+            with ui.column().classes("gap-0"):
+                ui.label(entry.name).classes("font-bold")
+                ui.label(entry.quality).classes("text-xs opacity-80")
+
+    def choose(self, entry: Entry) -> None:
+        """Show a motion."""
+        self._leave()
+        self.entry = entry
+        self._main.clear()
+        self.refresh()
+        try:
+            with self._main:
+                with ui.tabs().classes("w-full") as tabs:
+                    names = [ui.tab(name) for name in ("Motion", "Correct", "Export")]
+                with ui.tab_panels(tabs, value=names[0]).classes("w-full grow").props("keep-alive"):
+                    with ui.tab_panel(names[0]).classes("p-0"):
+                        self._frame = ui.html(self._report(), sanitize=False).classes("report")
+                    with ui.tab_panel(names[1]):
+                        correct = Correct(self, entry)
+                    with ui.tab_panel(names[2]):
+                        Exports(self, entry)
+            self._shown.append(correct.close)
+        except DrocapError as error:
+            with self._main:
+                ui.label(str(error)).classes("text-red")
+
+    def _report(self) -> str:
+        assert self.entry is not None
+        at = f"/library/{self.desk.key(self.entry)}/report?{secrets.token_hex(4)}"
+        return f'<iframe title="report" src="{at}"></iframe>'
+
+    def solved(self) -> None:
+        """The chosen motion has changed."""
+        self._frame.set_content(self._report())
+        self.refresh()
+
+    def _leave(self) -> None:
+        for close in self._shown:
+            with contextlib.suppress(OSError):
+                close()
+        self._shown.clear()
+
+    async def work(self, job: Job, done: Callable[[], Any] | None = None) -> bool:
+        """Run a command with its progress on the page; returns whether it went well."""
+        with ui.dialog().props("persistent") as dialog, ui.card().classes("w-96"):
+            title = ui.label(job.words[0].capitalize()).classes("text-base font-bold")
+            bar = ui.linear_progress(0.0, show_value=False).props("instant-feedback")
+            ui.label(job.command).classes("text-xs opacity-70 break-all font-mono")
+            ui.button("Cancel", on_click=job.cancel)
+
+        def show() -> None:
+            bar.props("indeterminate" if job.share < 0 else "", remove="" if job.share < 0 else "indeterminate")
+            bar.value = max(job.share, 0.0)
+            title.text = f"{job.stage or 'begins'} {100 * max(job.share, 0.0):.0f} %" if job.share >= 0 else "begins"
+
+        timer = ui.timer(0.2, show)
+        dialog.open()
+        try:
+            status = await job.run()
+        finally:
+            timer.cancel()
+            dialog.close()
+            dialog.delete()
+        self._said.text = "\n".join([job.command, *job.lines])
+        if status not in (0, 130):
+            words = job.lines[-1] if job.lines else f"ended with status {status}"
+            ui.notify(words, type="negative", position="top", multi_line=True, close_button="Close", timeout=0)
+        if status == 0 and done is not None:
+            done()
+        return status == 0
+
+
+def run(folder: Path, models: Path | None, port: int, show: bool) -> None:
+    """Serve the page on the loopback until it is interrupted."""
+    desk = Desk(folder, models)
+    ui.run(
+        lambda: Page(desk),
+        host="127.0.0.1",
+        port=port,
+        title="drocap",
+        dark=None,
+        show=show,
+        reload=False,
+        show_welcome_message=False,
+    )
+
+
+_STYLE = """
+.nicegui-content { padding: 0; }
+.desk { display: grid; grid-template-columns: minmax(260px, 340px) 1fr; width: 100%; min-height: calc(100vh - 52px); }
+.desk .side { padding: 12px; border-right: 1px solid #8884; overflow: auto; max-height: calc(100vh - 52px); }
+.desk .main { padding: 0 12px 12px; min-width: 0; }
+.chosen { outline: 2px solid var(--q-primary); }
+.thumb { width: 64px; height: 64px; object-fit: cover; border-radius: 4px; background: #8883; }
+.thumb:not([src]), .thumb[src=""] { visibility: hidden; }
+.report, .report iframe { width: 100%; height: calc(100vh - 120px); border: 0; }
+.said { white-space: pre-wrap; word-break: break-word; font: 11px monospace; opacity: 0.75; }
+.persons { display: flex; flex-wrap: wrap; gap: 6px; }
+@media (max-width: 800px) {
+  .desk { grid-template-columns: 1fr; }
+  .desk .side { border-right: 0; max-height: none; }
+}
+"""
