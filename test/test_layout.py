@@ -37,7 +37,7 @@ BUDGETS = {
     ("simulation",): 3.45,  # reports err as recorded ones
     ("evaluation",): 1.08,  # truth from C3D, TRC and BVH by the names of other programs (0.34), one of several bodies
     ("export", "report", "view"): 4.47,  # OpenSim, USD and FBX (0.17), a report of several persons, the video beside it
-    ("app",): 1.12,  # the page of clips, corrections and exports
+    ("app",): 1.15,  # the page of clips, corrections and exports
     ("ros", "nodes", "bringup"): 4.52,  # lockstep and processes of their own
     ("cli",): 4.87,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06, and 0.11 of perception)
     ("lab", "benchmarks"): 11.75,  # flights that are drawn (0.35), mutants of the product (0.17), heights (0.08)

@@ -17,13 +17,13 @@ from drocap_ros.perception.models.runtime import network_files
 from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
 
 if TYPE_CHECKING:
-    from drocap_ros.app.page import Page
+    from drocap_ros.app.desk import Host
 
 
 class Clips:
     """The part of the page that makes motions."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: Host) -> None:
         self._page, self._person = page, ""
         ui.label("Clips").classes("text-base font-bold")
         ui.upload(label="Drop videos and logs here", multiple=True, auto_upload=True, on_upload=self._keep).classes(

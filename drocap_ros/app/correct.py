@@ -15,8 +15,8 @@ from drocap_ros.corrections import parse_corrections, save_corrections
 from drocap_ros.skeleton import COLOURS, joint_set_of, side_of
 
 if TYPE_CHECKING:
+    from drocap_ros.app.desk import Host
     from drocap_ros.app.library import Entry
-    from drocap_ros.app.page import Page
 
 #: Width of the timeline, height of each of its three rows, and a click's most movement on it, px.
 _WIDTH, _ROW, _CLICK = 1000.0, 28.0, 6.0
@@ -33,7 +33,7 @@ def rgb(colour: tuple[int, int, int]) -> str:
 class Correct:
     """The part of the page that corrects a motion."""
 
-    def __init__(self, page: Page, entry: Entry) -> None:
+    def __init__(self, page: Host, entry: Entry) -> None:
         self._page, self._entry = page, entry
         self._pictures = page.desk.open_pictures(entry)
         self._said: dict[str, list[Any]] = {kind: list(rows) for kind, rows in entry.corrections().items()}

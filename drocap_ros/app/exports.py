@@ -12,8 +12,8 @@ from drocap_ros.app.jobs import Job
 from drocap_ros.export import FORMATS, RIGGED
 
 if TYPE_CHECKING:
+    from drocap_ros.app.desk import Host
     from drocap_ros.app.library import Entry
-    from drocap_ros.app.page import Page
 
 #: Format -> programs that open it.
 OPENED_BY = {
@@ -32,7 +32,7 @@ OPENED_BY = {
 class Exports:
     """The part of the page that writes a motion for other programs."""
 
-    def __init__(self, page: Page, entry: Entry) -> None:
+    def __init__(self, page: Host, entry: Entry) -> None:
         self._page, self._entry = page, entry
         with ui.column().classes("w-full max-w-xl"):
             labels = {form: f"{form}: {facts}" for form, facts in FORMATS.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import shlex
 import signal
 import sys
@@ -11,6 +12,8 @@ from dataclasses import dataclass, field
 
 #: Lines of a command's output that are kept.
 _MOST_LINES = 200
+#: A line of progress on stderr, as ``DROCAP_PROGRESS`` asks for it, and none on stdout.
+_PROGRESS, _SAID = re.compile(r"(-?\d+\.\d{3}) (.*)"), re.compile(r"(?!)")
 
 
 @dataclass
@@ -44,17 +47,16 @@ class Job:
         )
         assert process.stdout is not None
         assert process.stderr is not None
-        await asyncio.gather(self._read(process.stdout), self._read(process.stderr))
+        await asyncio.gather(self._read(process.stdout, _SAID), self._read(process.stderr, _PROGRESS))
         self.status = await process.wait()
         return self.status
 
-    async def _read(self, stream: asyncio.StreamReader) -> None:
+    async def _read(self, stream: asyncio.StreamReader, progress: re.Pattern[str]) -> None:
         async for raw in stream:
             line = raw.decode(errors="replace").rstrip()
-            number, _, stage = line.partition(" ")
-            try:
-                self.share, self.stage = float(number), stage
-            except ValueError:
+            if found := progress.fullmatch(line):
+                self.share, self.stage = float(found[1]), found[2]
+            else:
                 self.lines = [*self.lines, line][-_MOST_LINES:]
 
     def cancel(self) -> None:

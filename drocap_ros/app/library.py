@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import functools
-import logging
 import shlex
 import tempfile
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,8 +22,6 @@ from drocap_ros.report.motion_images import FollowingBox, each_image
 from drocap_ros.report.page import images_of_page
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.tracks import Tracks, load_tracks
-
-logger = logging.getLogger(__name__)
 
 #: Longer side (px) of the pictures of a clip that is corrected.
 _LONG_SIDE = 1600
@@ -64,8 +60,11 @@ class Entry:
 
     @property
     def quality(self) -> str:
-        """The sentence of the summary."""
-        return _quality(self.folder / FILE, (self.folder / FILE).stat().st_mtime_ns)
+        """The sentence of the summary, or why there is none."""
+        try:
+            return _quality(self.folder / FILE, (self.folder / FILE).stat().st_mtime_ns)
+        except (DrocapError, OSError) as error:
+            return str(error)
 
     @property
     def thumbnail(self) -> bytes | None:
@@ -112,17 +111,11 @@ class Entry:
         return words
 
 
-def motions(folder: Path) -> Iterator[Entry]:
+def motions(folder: Path) -> list[Entry]:
     """Motions in the folders of a folder, those of several persons one by one; the newest first."""
     files = [path for pattern in (f"*/{FILE}", f"*/person_*/{FILE}") for path in folder.glob(pattern)]
-    for path in sorted(files, key=lambda path: (-path.stat().st_mtime_ns, path)):
-        entry = Entry(path.parent, str(path.parent.relative_to(folder)))
-        try:
-            logger.debug("%s: %s", entry.name, entry.quality)
-        except DrocapError as error:
-            logger.warning("%s", error)
-            continue
-        yield entry
+    files.sort(key=lambda path: (-path.stat().st_mtime_ns, path))
+    return [Entry(path.parent, str(path.parent.relative_to(folder))) for path in files]
 
 
 @functools.lru_cache(maxsize=8)

@@ -2,84 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import hashlib
 import secrets
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from nicegui import app, ui
-from starlette.responses import FileResponse, HTMLResponse, Response
+from nicegui import ui
 
 from drocap_ros.app.clips import Clips
 from drocap_ros.app.correct import Correct
+from drocap_ros.app.desk import Desk
 from drocap_ros.app.exports import Exports
 from drocap_ros.app.jobs import Job
-from drocap_ros.app.library import Entry, Pictures, motions
+from drocap_ros.app.library import Entry, motions
 from drocap_ros.errors import DrocapError
-
-
-class Desk:
-    """What all pages of one server share: the folder, the networks, pictures of the clips that are corrected."""
-
-    def __init__(self, folder: Path, models: Path | None) -> None:
-        self.folder, self.models = folder, models
-        self._entries: dict[str, Entry] = {}
-        self._pictures: dict[str, tuple[Pictures, int]] = {}
-        app.get("/library/{key}/report")(self._report)
-        app.get("/library/{key}/thumbnail")(self._thumbnail)
-        app.get("/library/{key}/frame/{index}")(self._frame)
-        app.on_shutdown(self.close)
-
-    def key(self, entry: Entry) -> str:
-        """The name of an entry in addresses."""
-        key = hashlib.sha256(entry.name.encode()).hexdigest()[:16]
-        self._entries[key] = entry
-        return key
-
-    def _entry(self, key: str) -> Entry | None:
-        return self._entries.get(key)
-
-    def _report(self, key: str) -> Response:
-        entry = self._entry(key)
-        if entry is None or not entry.report.exists():
-            return HTMLResponse("<p>no report: it was left out</p>", status_code=404)
-        return FileResponse(entry.report, media_type="text/html", headers={"Cache-Control": "no-store"})
-
-    def _thumbnail(self, key: str) -> Response:
-        entry = self._entry(key)
-        jpeg = entry.thumbnail if entry else None
-        return Response(jpeg, media_type="image/jpeg") if jpeg else Response(status_code=404)
-
-    def _frame(self, key: str, index: int, close: int = 0) -> Response:
-        entry = self._entry(key)
-        shown = self._pictures.get(key)
-        jpeg = shown[0].jpeg(index, bool(close)) if entry and shown else None
-        return Response(jpeg, media_type="image/jpeg") if jpeg else Response(status_code=404)
-
-    def open_pictures(self, entry: Entry) -> Pictures:
-        """The pictures of a clip, shared by all pages that show it, until each has closed them."""
-        key = self.key(entry)
-        pictures, users = self._pictures.get(key) or (Pictures(entry), 0)
-        self._pictures[key] = pictures, users + 1
-        return pictures
-
-    def close_pictures(self, entry: Entry) -> None:
-        """A page shows them no more."""
-        key = self.key(entry)
-        if key in self._pictures:
-            pictures, users = self._pictures.pop(key)
-            if users > 1:
-                self._pictures[key] = pictures, users - 1
-            else:
-                pictures.close()
-
-    def close(self) -> None:
-        """Remove what was kept for the pages."""
-        for pictures, _ in self._pictures.values():
-            pictures.close()
-        self._pictures.clear()
 
 
 class Page:
@@ -106,16 +44,15 @@ class Page:
             self._main = ui.column().classes("main")
         ui.context.client.on_delete(self._leave)
         self.refresh()
-        first = next(iter(motions(desk.folder)), None)
-        if first is not None:
-            self.choose(first)
+        if found := motions(desk.folder):
+            self.choose(found[0])
         else:
             with self._main:
                 ui.label("Drop a video, or choose one, and press Reconstruct.").classes("text-base opacity-80 p-8")
 
     def show_newest(self) -> None:
         """A motion was made."""
-        self.choose(next(motions(self.desk.folder)))
+        self.choose(motions(self.desk.folder)[0])
 
     def refresh(self) -> None:
         """Show the library as the folder is now."""
@@ -134,7 +71,15 @@ class Page:
             ui.html(f'<img class="thumb" alt="" src="/library/{key}/thumbnail?{secrets.token_hex(4)}">', sanitize=False)
             with ui.column().classes("gap-0"):
                 ui.label(entry.name).classes("font-bold")
-                ui.label(entry.quality).classes("text-xs opacity-80")
+                quality = ui.label().classes("text-xs opacity-80")
+
+        async def fill() -> None:  # checks of many motions take a while
+            words = await asyncio.to_thread(lambda: entry.quality)
+            if not quality.is_deleted:
+                quality.text = words
+
+        with card:
+            ui.timer(0.0, fill, once=True)
 
     def choose(self, entry: Entry) -> None:
         """Show a motion."""

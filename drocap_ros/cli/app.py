@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import socket
 from pathlib import Path
 
 from drocap_ros.cli.options import Subparsers, add_command
@@ -37,6 +38,14 @@ def run(args: argparse.Namespace) -> int:
         if str(error.name).startswith("drocap_ros"):
             raise
         raise InputError(f"app: expected {error.name}, found none; run: pip install 'drocap_ros[app]'") from None
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", args.port))
+        except (OSError, OverflowError):
+            raise InputError(
+                f"--port {args.port}: expected a free port, found it in use or none; choose another"
+            ) from None
     print(f"http://127.0.0.1:{args.port}/ (Ctrl-C ends it)", flush=True)
     page.run(args.folder.resolve(), args.models, args.port, not args.no_browser)
     return 0

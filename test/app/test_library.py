@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import shutil
+import socket
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +32,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_library_has_motions_of_one_and_of_several_and_leaves_damaged_ones_out(made: Path, tmp_path: Path) -> None:
+def test_the_library_has_motions_of_one_and_of_several_and_says_what_is_damaged(made: Path, tmp_path: Path) -> None:
     for name in ("one", "all/person_1", "all/person_2", "damaged"):
         shutil.copytree(made / "walk_motion", tmp_path / name)
     (tmp_path / "damaged" / "motion.npz").write_bytes(b"PK")
     (tmp_path / "empty").mkdir()
-    assert sorted(entry.name for entry in motions(tmp_path)) == ["all/person_1", "all/person_2", "one"]
+    found = {entry.name: entry.quality for entry in motions(tmp_path)}
+    assert sorted(found) == ["all/person_1", "all/person_2", "damaged", "one"]
+    assert "expected a readable .npz archive" in found["damaged"]
     assert not clips(tmp_path)
     entry = Entry(tmp_path / "one", "one")
     assert entry.thumbnail is None
@@ -109,3 +112,9 @@ def test_a_job_that_is_cancelled_leaves_nothing(tmp_path: Path) -> None:
 def test_the_command_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["app", str(tmp_path / "nowhere")]) == 2
     assert "expected a folder for clips and motions, found none" in capsys.readouterr().err
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert main(["app", str(tmp_path), "--no-browser", "--port", str(taken.getsockname()[1])]) == 2
+    assert "expected a free port" in capsys.readouterr().err
+    assert main(["app", str(tmp_path), "--no-browser", "--port", "70000"]) == 2
