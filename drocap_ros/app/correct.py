@@ -54,12 +54,14 @@ class Correct:
     def _read(self) -> None:
         """What is shown of the motion as it is solved now."""
         self._motion, self._tracks = self._entry.motion, self._entry.tracks
-        stamp_ns = self._motion.stamp_ns
+        stamp_ns, motion = self._tracks.stamp_ns, self._motion
         self._seconds = (stamp_ns - stamp_ns[0]) * 1e-9
+        # One of several persons has tracks in all images, and a motion while it is seen.
+        self._rows = np.searchsorted(stamp_ns, motion.stamp_ns).clip(0, len(stamp_ns) - 1)
         rate = 1.0 / max(float(np.median(np.diff(self._seconds))), 1e-3) if len(stamp_ns) > 1 else 30.0
-        ankles = [self._motion.joints.index(f"{side[0]}ankle") for side in _FEET]
-        in_world = self._motion.frame == "world"
-        self._rests = [rest_spans(self._motion.joints3d[:, a], rate) if in_world else [] for a in ankles]
+        ankles = [motion.joints3d[:, motion.joints.index(f"{side[0]}ankle")] for side in _FEET]
+        spans = [rest_spans(ankle, rate) if motion.frame == "world" else [] for ankle in ankles]
+        self._rests = [[(self._rows[a], self._rows[b - 1] + 1) for a, b in of_foot] for of_foot in spans]
         source, place = joint_set_of(self._tracks.joints)
         bones = [(int(place[a]), int(place[b])) for a, b in source.bones]
         self._bones = [(a, b) for a, b in bones if a >= 0 and b >= 0]
@@ -71,9 +73,11 @@ class Correct:
         for span, box in parse_corrections(self._said).person:
             rows = span.of(self._seconds)
             self._meant[rows] = np.nan
+            solved = np.flatnonzero(rows[self._rows])
             for joint, name in enumerate(self._tracks.joints if box is not None else ()):
                 if name in self._motion.joints:
-                    self._meant[rows, joint] = self._motion.keypoints[rows, self._motion.joints.index(name)]
+                    found = self._motion.keypoints[solved, self._motion.joints.index(name)]
+                    self._meant[self._rows[solved], joint] = found
 
     def _build(self) -> None:
         with ui.row().classes("w-full items-center gap-2"):

@@ -18,7 +18,7 @@ from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.motion import FILE, Motion, load_motion
 from drocap_ros.parameters import Values
 from drocap_ros.report.checks import quality_sentence, run_checks
-from drocap_ros.report.motion_images import FollowingBox, each_image
+from drocap_ros.report.motion_images import FollowingBox, ShownTracks, each_image
 from drocap_ros.report.page import images_of_page
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.tracks import Tracks, load_tracks
@@ -130,28 +130,29 @@ def _quality(path: Path, changed_ns: int) -> str:
 
 
 class Pictures:
-    """The images of a motion as JPEG files, read in a thread of its own, whole and as crops about the person."""
+    """The images of a motion's tracks as JPEG files, read in a thread, whole and as crops about the person."""
 
     def __init__(self, entry: Entry) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="drocap_app_")
         self._stop, self.read, self.error = threading.Event(), 0, ""
-        motion, self._boxes = entry.motion, FollowingBox()
-        self.scale, self.size = 1.0, entry.tracks.image_size
+        tracks, box = entry.tracks, FollowingBox()
+        self.scale, self.size = 1.0, tracks.image_size
         self.boxes: list[tuple[int, int, int, int]] = [
-            self._boxes(int(stamp_ns), keypoints, self.size[::-1])
-            for stamp_ns, keypoints in zip(motion.stamp_ns, motion.keypoints, strict=True)
+            box(int(stamp_ns), keypoints, self.size[::-1])
+            for stamp_ns, keypoints in zip(tracks.stamp_ns, tracks.keypoints, strict=True)
         ]
-        self._thread = threading.Thread(target=self._fill, args=(entry.video, motion), daemon=True)
+        shown = ShownTracks(tracks.stamp_ns, tracks.keypoints, entry.motion.meta)
+        self._thread = threading.Thread(target=self._fill, args=(entry.video, shown), daemon=True)
         self._thread.start()
 
-    def _fill(self, video: Path | None, motion: Motion) -> None:
+    def _fill(self, video: Path | None, shown: ShownTracks) -> None:
         import cv2
 
         if video is None:
             self.error = "the video of this motion is not found beside it"
             return
         try:
-            for index, image in each_image(video, motion):
+            for index, image in each_image(video, shown):
                 if self._stop.is_set() or self.read >= _MOST_PICTURES:
                     return
                 shrink = min(1.0, _LONG_SIDE / max(image.shape[:2]))

@@ -68,9 +68,10 @@ class Page:
         for event in ("click", "keydown.enter"):
             card.on(event, lambda entry=entry: self.choose(entry))
         with card, ui.row().classes("items-center no-wrap w-full"):
-            ui.html(f'<img class="thumb" alt="" src="/library/{key}/thumbnail?{secrets.token_hex(4)}">', sanitize=False)
-            with ui.column().classes("gap-0"):
-                ui.label(entry.name).classes("font-bold")
+            at = f"/library/{key}/thumbnail?{secrets.token_hex(4)}"
+            ui.html(f'<img class="thumb" alt="" onerror="this.style.opacity=0" src="{at}">', sanitize=False)
+            with ui.column().classes("gap-0 min-w-0"):
+                ui.label(entry.name).classes("font-bold break-all")
                 quality = ui.label().classes("text-xs opacity-80")
 
         async def fill() -> None:  # checks of many motions take a while
@@ -171,7 +172,6 @@ _STYLE = """
 .desk .main { padding: 0 12px 12px; min-width: 0; }
 .chosen { outline: 2px solid var(--q-primary); }
 .thumb { width: 64px; height: 64px; object-fit: cover; border-radius: 4px; background: #8883; }
-.thumb:not([src]), .thumb[src=""] { visibility: hidden; }
 .report, .report iframe { width: 100%; height: calc(100vh - 120px); border: 0; }
 .said { white-space: pre-wrap; word-break: break-word; font: 11px monospace; opacity: 0.75; }
 .persons { display: flex; flex-wrap: wrap; gap: 6px; }

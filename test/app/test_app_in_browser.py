@@ -144,6 +144,8 @@ def folder(desk: tuple[Path, str], hand: Hand, tmp_path_factory: pytest.TempPath
     out = desk[0] / "three_motion"
     wait(lambda: (out / "motion.npz").exists() and idle(hand), "a motion")
     assert load_motion(out).meta["person"] == 2
+    card = "document.querySelector('[data-motion=three_motion]').textContent"
+    wait(lambda: "quality: " in browser.run(card), "the quality of the motion")
     assert hand.clicks == 3
     hand.press("Correct")
     picture = "document.querySelector('[data-part=picture] img')"
