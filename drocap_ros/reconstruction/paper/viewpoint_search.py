@@ -31,6 +31,12 @@ class SparseFit:
     rotation: np.ndarray
     shape: np.ndarray
 
+    @property
+    def camera_shape(self) -> np.ndarray:
+        """(F, P, 3) poses in camera axes."""
+        turned: np.ndarray = self.shape @ np.swapaxes(self.rotation, 1, 2)
+        return turned
+
 
 def fit_sparse(
     projection: Projection,

@@ -29,11 +29,11 @@ MOST_PAIRS = 4000
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """Factor on the assumed scale, its relative standard deviation, and the share of still feet."""
+    """Factor on the assumed scale, its relative standard deviation, and the share of still feet, 0 = by other means."""
 
     factor: float
     std: float
-    support: float
+    support: float = 0.0
 
     @property
     def trusted(self) -> bool:

@@ -33,20 +33,12 @@ from drocap_ros.reconstruction.world.world_model import (
 from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, weights_of
 
 
-class Posterior(NamedTuple):
-    """Covariances at a unit variance of every residual.
+def posterior(equations: Equations, state: WorldState) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Covariances at a unit variance of every residual, from the equations at the solution; None = not definite.
 
-    place : (3, 3) m^2 of the mean place of all joints of all frames, in the world
-    joints : (F, 17, 3, 3) m^2 about it; shared : of the shared unknowns
+    That is of the mean place of all joints of all frames in the world, (3, 3) m^2, of the joints about it,
+    (F, 17, 3, 3) m^2, and of the shared unknowns.
     """
-
-    place: np.ndarray
-    joints: np.ndarray
-    shared: np.ndarray
-
-
-def posterior(equations: Equations, state: WorldState) -> Posterior | None:
-    """Covariances from the equations at the solution; None = not positive definite."""
     found = Covariances.of(equations)
     if found is None:
         return None
@@ -67,7 +59,7 @@ def posterior(equations: Equations, state: WorldState) -> Posterior | None:
     own = found.of_frames(mean.reshape(-1, 3)).reshape(mean.shape)[:, cameras:] / scale
     with_place = own.reshape(frames, JOINTS, 3, 3) + lever @ (found.shared @ lever.mean(axis=(0, 1)).T)
     place = with_place.mean(axis=(0, 1))
-    return Posterior(place, joints - with_place - np.swapaxes(with_place, -1, -2) + place, found.shared)
+    return place, joints - with_place - np.swapaxes(with_place, -1, -2) + place, found.shared
 
 
 #: Relative decrease of the cost below which the adjustment has converged.
@@ -226,9 +218,9 @@ def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason
     findings = Findings.unknown()
     if found is not None:
         widest = np.sqrt(fact * np.diag(np.linalg.inv(prior)))
-        shared = found.shared[:GLOBALS, :GLOBALS]
+        place, covariance = fact * found[0], fact * found[1]
+        shared = found[2][:GLOBALS, :GLOBALS]
         std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(shared)), widest)
-        place, covariance = fact * found.place, fact * found.joints
         turns = _STD_FACTOR**2 * fact * axes @ shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
         least = fact * axes @ np.linalg.inv(prior[MISALIGNMENT, MISALIGNMENT]) @ axes.T
         turned_std = np.sqrt(np.minimum(np.diag(turns), np.diag(least)))
