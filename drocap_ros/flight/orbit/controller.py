@@ -36,7 +36,6 @@ from drocap_ros.flight.orbit.states import (
     Fault,
     Holding,
     Idle,
-    Limits,
     ModeRequest,
     OperatorCommand,
     Orbiting,
@@ -81,7 +80,6 @@ class ControlStatus(NamedTuple):
 
 _STANDING_M_S = 0.05  # speed below which a setpoint stands
 _GIMBAL_PERIOD_S = 0.5  # between pitches of the mount: radius and height change slowly
-_MODE_AGE_STEPS = 1.5  # a report of the mode is seen in the step that follows it
 
 
 class OrbitController:
@@ -93,14 +91,8 @@ class OrbitController:
 
     def __init__(self, link: MavlinkLink, config: MavlinkBridgeConfig, watchdog: Watchdog | None = None) -> None:
         self._link, self._config, self._watchdog = link, config, watchdog
-        self._limits = Limits(
-            config,
-            config,
-            max_control_timeout_s=config.max_control_timeout_s,
-            max_mode_age_s=_MODE_AGE_STEPS / config.control_hz,
-        )
         self._observer, self._desk = Observer(config), CommandDesk(config)
-        self._orbit = FlownOrbit(config, self._limits)
+        self._orbit = FlownOrbit(config)
         self._queue = CommandQueue()
         self._lock = threading.Lock()
         self.safety: SafetyState = Idle()
@@ -174,8 +166,7 @@ class OrbitController:
         self._desk.hear_operator(now_ns, now_s)
         order = self._desk.next(now_ns, self.safety, self._orbit.goal, self._observer.framing)
         before = self.safety
-        limits = self._limits._replace(warm_up_s=seen.autopilot.warm_up_s)
-        self.safety, decision = reduce(before, seen, now_s, order.kind if order else None, limits)
+        self.safety, decision = reduce(before, seen, now_s, order.kind if order else None, self._config)
         if order is not None and decision.answer is not None:
             self._desk.answer(order.command, decision.answer)
             if decision.answer.accepted:
@@ -260,7 +251,7 @@ class OrbitController:
             commands = FallbackCommands(
                 self._link.check_motion(hold),
                 self._link.check_motion(mode),
-                lambda: self._link.fresh_mode(self._limits.max_mode_age_s) == autopilot.control_mode,
+                lambda: self._link.fresh_mode(self._config.max_mode_age_s) == autopilot.control_mode,
                 lambda: self._link.estimator.modes.mode != autopilot.control_mode,
             )
         self._watchdog.kick(now_s, commands)
@@ -281,7 +272,7 @@ class OrbitController:
             condition=self._orbit.flown_condition(present, seen) if orbiting else present,
             failed=self.safety.failed if isinstance(self.safety, Idle) else None,
             mode_failure=self._queue.failure(SET_MODE),
-            way_out=way_out(self.safety, seen, self._limits),
+            way_out=way_out(self.safety, seen, self._config),
             answers=self._desk.take_answers(),
             radius_m=distance_m,
             height_m=vehicle.height.m,
