@@ -97,6 +97,15 @@ def smoothed(values: np.ndarray, sigma: float) -> np.ndarray:
     return out
 
 
+def peak(values: np.ndarray, best: int) -> float:
+    """Place of the top of the parabola through three values (N,), in samples from the middle one."""
+    if not 0 < best < len(values) - 1:
+        return 0.0
+    before, here, after = values[best - 1 : best + 2]
+    bend = before - 2.0 * here + after
+    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0
+
+
 #: Smoothing of the path through the steps.
 _SMOOTHING_S = 0.25
 #: A coordinate that changes by less from frame to frame rests: less than any log's rounding.

@@ -23,7 +23,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.flight.vehicle import camera_rotation
-from drocap_ros.geometry.interpolation import interpolate
+from drocap_ros.geometry.interpolation import interpolate, peak
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.perception.calibration import camera_model
 from drocap_ros.perception.sources.base import ImageIngestConfig
@@ -252,21 +252,12 @@ def correlate_turning(
     second = fit[rivals].max(initial=-1.0)
     if fit[best] < MIN_CORRELATION or fit[best] - second < MIN_LEAD:
         return None
-    return float(offset[best] + _peak(fit, best) / RATE_HZ), float(fit[best])
+    return float(offset[best] + peak(fit, best) / RATE_HZ), float(fit[best])
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
     kernel = np.array([0.25, 0.5, 0.25])
     return np.convolve(np.pad(values, 1, mode="edge"), kernel, mode="valid")
-
-
-def _peak(fit: np.ndarray, best: int) -> float:
-    """Vertex of the parabola through three neighbours, in steps from the middle one."""
-    if not 0 < best < len(fit) - 1:
-        return 0.0
-    a, b, c = fit[best - 1 : best + 2]
-    bend = a - 2 * b + c
-    return float(np.clip(0.5 * (a - c) / bend, -0.5, 0.5)) if bend < 0 else 0.0
 
 
 logger = logging.getLogger(__name__)

@@ -42,7 +42,7 @@ def unknown_mount(loop: OrbitLoop) -> None:
 
     def unknown(*arguments: Any) -> Any:
         reported = report(*arguments)
-        return None if reported is None else reported._replace(quaternion_wxyz=np.full(4, np.nan))
+        return None if reported is None else (np.full(4, np.nan), reported[1])
 
     mount.report = unknown  # type: ignore[method-assign, assignment]
 

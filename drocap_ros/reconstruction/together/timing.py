@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.geometry.interpolation import usual_step
+from drocap_ros.geometry.interpolation import peak, usual_step
 from drocap_ros.skeleton import BODY_17, indices
 
 #: Rate (Hz) at which motions are compared.
@@ -62,7 +62,7 @@ def time_offsets(first: ShownMotion, second: ShownMotion, *, level: bool = True)
     found: list[TimeOffset] = []
     while len(found) < 4 and left.max() > 0.0:
         best = int(left.argmax())
-        seconds = (lag[best] + _peak(score, best)) / RATE_HZ + first.time_s[0] - second.time_s[0]
+        seconds = (lag[best] + peak(score, best)) / RATE_HZ + first.time_s[0] - second.time_s[0]
         left[max(best - round(_APART_S * RATE_HZ), 0) : best + round(_APART_S * RATE_HZ) + 1] = 0.0
         found.append(TimeOffset(float(seconds), float(score[best])))
     return found
@@ -109,12 +109,3 @@ def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
     # A long time together says more than a short one that is as alike.
     score *= np.minimum(1.0, overlap / shorter) ** 0.25
     return np.where(overlap >= LEAST_S * RATE_HZ - 0.5, score, 0.0)
-
-
-def _peak(score: np.ndarray, best: int) -> float:
-    """Place of the parabola's top through three scores, in samples from the middle one."""
-    if not 0 < best < len(score) - 1:
-        return 0.0
-    before, here, after = score[best - 1 : best + 2]
-    bend = before - 2.0 * here + after
-    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0

@@ -15,6 +15,7 @@ from drocap_ros.errors import InputError, first_line
 from drocap_ros.flight.vehicle import orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import (
+    FIX_3D,
     Lack,
     LogFormat,
     LogLack,
@@ -39,7 +40,6 @@ _FIELDS = {
     "GPS": ("Lat", "Lng", "Alt", "Status"),
     "MNT": ("Roll", "Pitch", "YawE", "YawB", "I"),
 }
-_FIX_3D = 3  # status of a GPS with a fix in three dimensions; more are better ones
 _PARAMETER = "PARM"
 #: ArduPilot's parameter for the kind of a mount, by its number from 1 on; of the first one also without a number.
 _MOUNT_TYPE = re.compile(r"MNT(\d?)_TYPE")
@@ -112,7 +112,7 @@ def _position(content: _Content, stamp_ns: np.ndarray) -> tuple[np.ndarray | Non
         if not content.rows[name]:
             continue
         known_ns, geodetic = content.series(name)
-        lost = (geodetic[:, :2] == 0).all(axis=1) | (geodetic[:, 3:] < _FIX_3D).any(axis=1)
+        lost = (geodetic[:, :2] == 0).all(axis=1) | (geodetic[:, 3:] < FIX_3D).any(axis=1)
         geodetic[lost] = np.nan
         if (enu := from_first_fix(geodetic[:, :3])) is not None:
             return at_stamps(known_ns, enu, stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, name)]

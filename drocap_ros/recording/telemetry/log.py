@@ -18,6 +18,8 @@ from drocap_ros.geometry.interpolation import interpolate, true_runs, without_st
 from drocap_ros.geometry.rotations import quaternion_multiply, unit_quaternions
 from drocap_ros.tracks import Tracks
 
+#: Kind of a receiver's fix in three dimensions, by PX4, ArduPilot and GoPro; more are better ones.
+FIX_3D = 3
 #: Interpolation over longer gaps than this is reported.
 REPORTED_GAP_S = 1.0
 #: Share of the images that must have a pose; with fewer the telemetry is left out, not the images.
@@ -192,6 +194,12 @@ class Series(NamedTuple):
     gimbal: np.ndarray
     aircraft: np.ndarray
     geodetic: np.ndarray
+
+    @staticmethod
+    def of_places(stamp_ns: np.ndarray, geodetic: np.ndarray) -> Series:
+        """Those of a file without attitudes."""
+        unknown = np.full((len(geodetic), 3), np.nan)
+        return Series(stamp_ns, unknown, unknown, geodetic)
 
 
 def plausible(path: Path, series: Series) -> tuple[Series, list[LogLack]]:

@@ -158,14 +158,6 @@ _NO_YAW = 1024 | 2048  # POSITION_TARGET_TYPEMASK: neither yaw nor its rate
 _PLACES = {mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT}
 
 
-class Readiness(NamedTuple):
-    """Path times, s, from which there is a satellite fix, a healthy estimator, and an origin of the local frame."""
-
-    fix_s: float = -1.0
-    estimator_s: float = -1.0
-    origin_s: float = -1.0
-
-
 class CopterSetup(NamedTuple):
     """Of a simulated copter.
 
@@ -175,7 +167,7 @@ class CopterSetup(NamedTuple):
     timeout_s : its own time-out without setpoints
     mode : at first; "" = that of the sticks
     mount : of the camera; None = a gimbal, level
-    readiness : when what the pilot waits for comes, one after the other
+    ready_s : path times, s, from which there is a satellite fix, a healthy estimator, and an origin of the local frame
     """
 
     autopilot: str = "ardupilot"
@@ -187,14 +179,15 @@ class CopterSetup(NamedTuple):
     timeout_s: float = 0.5
     mode: str = "LOITER"
     mount: SimulatedMount | None = None
-    readiness: Readiness = Readiness()
+    ready_s: tuple[float, float, float] = (-1.0, -1.0, -1.0)
 
 
 class ReportingCopter(SimulatedVehicle):
     """State of a copter and its telemetry; see :class:`drocap_ros.simulation.vehicle.copter.SimulatedCopter`."""
 
     def __init__(self, transport: Transport, position: np.ndarray, yaw: float, setup: CopterSetup) -> None:
-        self.mount, self.readiness = setup.mount or SimulatedMount(), setup.readiness
+        self.mount = setup.mount or SimulatedMount()
+        self._fix_s, self._estimator_s, self._origin_s = setup.ready_s
         super().__init__(transport, None, setup.autopilot, gimbal=self.mount.kind != "fixed")
         if self.kind.mount_type_setting:
             self.settings[self.kind.mount_type_setting] = float(MOUNT_TYPES[self.mount.kind])
@@ -260,7 +253,7 @@ class ReportingCopter(SimulatedVehicle):
         return super()._all_encoders() | {mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: self._echo}
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message | None:
-        if number in _PLACES and self._t < self.readiness.origin_s:
+        if number in _PLACES and self._t < self._origin_s:
             return None
         return super()._telemetry(number, self._report_s if self.frozen and self.frozen_clock else t_s, pose)
 
@@ -269,17 +262,16 @@ class ReportingCopter(SimulatedVehicle):
         mounted = self.mount.report(pose.orientation_xyzw, (pitch, yaw))
         if mounted is None:
             return None
-        return self._mav.gimbal_device_attitude_status_encode(
-            0, 0, self._boot_ms(t_s), mounted.flags, mounted.quaternion_wxyz, 0, 0, 0, 0
-        )
+        quaternion, flags = mounted
+        return self._mav.gimbal_device_attitude_status_encode(0, 0, self._boot_ms(t_s), flags, quaternion, 0, 0, 0, 0)
 
     def _estimator_flags(self) -> int:
         lost = self._t > min(self.ekf_failed_s, self.gps_lost_s + EKF_NOTICED_S)
-        blind = lost or self._t < self.readiness.estimator_s
+        blind = lost or self._t < self._estimator_s
         return _CONSTANT_POSITION if blind else super()._estimator_flags()
 
     def _satellites(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message:
-        there = self.readiness.fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
+        there = self._fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
         fix, place = 3 if there else 1, (473977420, 85455940, 488000)
         return self._mav.gps_raw_int_encode(self._boot_ms(t_s) * 1000, fix, *place, 60, 90, 0, 0, 17)
 

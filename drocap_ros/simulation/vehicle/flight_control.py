@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drocap_ros.flight.autopilot import Autopilot
-from drocap_ros.flight.autopilot.autopilot import Gains, Simulated
+from drocap_ros.flight.autopilot.autopilot import Simulated
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
 
 MAX_LEAN_M_S2 = 5.66  # 30 degrees
@@ -42,14 +42,14 @@ class Manner(enum.Enum):
 
 
 class FlightControl:
-    """Loops that command the body's acceleration.
+    """Loops that command the body's acceleration; stops and sticks.
 
     A subclass shapes what they follow: ``place``, ``pace`` and ``push`` are the wanted horizontal position, velocity
     and acceleration; ``place`` None leaves the position free.
     """
 
-    def __init__(self, gains: Gains, position: np.ndarray, yaw: float, drag: np.ndarray) -> None:
-        self.gains = gains
+    def __init__(self, simulated: Simulated, position: np.ndarray, yaw: float, drag: np.ndarray) -> None:
+        self._simulated, self.gains = simulated, simulated.gains
         self.target = Target(position=position.astype(float).copy(), yaw=yaw)
         self.manner = Manner.HOLD
         self.place: list[float] | None = [float(v) for v in position[:2]]
@@ -143,10 +143,15 @@ class FlightControl:
         command = _CLIMB_RATE_GAIN * error
         return min(max(command, -_MAX_CLIMB_M_S2), _MAX_CLIMB_M_S2) + self._integral[2]
 
-    def _stop_pace(self, gain: float, most: float, jerk: float, dt: float) -> None:
-        """Slow the wanted velocity down: rate ``gain`` per s, at most ``most`` m/s^2."""
-        wanted = limited(-gain * self.pace[0], -gain * self.pace[1], most)
-        self._advance(wanted, jerk, dt)
+    def _without_setpoints(self, dt: float) -> None:
+        """Move the wanted velocity towards that of the stick, or slow it down."""
+        simulated = self._simulated
+        if self.manner == Manner.STICK:
+            decay, wanted = simulated.stick, (float(self.target.velocity[0]), float(self.target.velocity[1]))
+        else:
+            decay, wanted = simulated.stop if self.manner == Manner.BRAKE else simulated.hold, (0.0, 0.0)
+        x, y = (decay.gain_per_s * (wanted[i] - self.pace[i]) for i in (0, 1))
+        self._advance(limited(x, y, decay.most_m_s2), simulated.jerk_m_s3, dt)
 
     def _advance(self, wanted: tuple[float, float], jerk: float, dt: float) -> None:
         """Move the wanted place and velocity; its acceleration follows ``wanted`` within the jerk.
@@ -205,25 +210,7 @@ def manner_of(autopilot: Autopilot, mode: str) -> Manner:
     return Manner.BRAKE if mode == autopilot.hold_mode else Manner.HOLD
 
 
-class _AutopilotControl(FlightControl):
-    """Stops and sticks."""
-
-    def __init__(self, simulated: Simulated, position: np.ndarray, yaw: float, drag: np.ndarray) -> None:
-        super().__init__(simulated.gains, position, yaw, drag)
-        self._simulated = simulated
-
-    def _without_setpoints(self, dt: float) -> None:
-        simulated, stick = self._simulated, self._simulated.stick
-        if self.manner == Manner.STICK:
-            gap = (float(self.target.velocity[i]) - self.pace[i] for i in (0, 1))
-            x, y = (stick.gain_per_s * v for v in gap)
-            self._advance(limited(x, y, stick.most_m_s2), simulated.jerk_m_s3, dt)
-        else:
-            decay = simulated.stop if self.manner == Manner.BRAKE else simulated.hold
-            self._stop_pace(decay.gain_per_s, decay.most_m_s2, simulated.jerk_m_s3, dt)
-
-
-class ContinuedControl(_AutopilotControl):
+class ContinuedControl(FlightControl):
     """Velocity grows by the acceleration, the position by both, until the time-out.
 
     Then velocity and acceleration become zero and the place that was reached is the target.  A copy of the target,
@@ -302,7 +289,7 @@ class ContinuedControl(_AutopilotControl):
         target.velocity = target.velocity + target.acceleration * dt
 
 
-class HeldControl(_AutopilotControl):
+class HeldControl(FlightControl):
     """A setpoint does not move on: its position, velocity and acceleration act together until the mode changes.
 
     Fitted to the recorded flights of PX4's SIH simulator.
