@@ -78,10 +78,6 @@ class ControlStatus(NamedTuple):
         return "; ".join(filter(None, (present, failed, self.way_out)))
 
 
-_STANDING_M_S = 0.05  # speed below which a setpoint stands
-_GIMBAL_PERIOD_S = 0.5  # between pitches of the mount: radius and height change slowly
-
-
 class OrbitController:
     """Flies the orbit through a link.  States, images and commands may come from other threads than the steps.
 
@@ -210,7 +206,8 @@ class OrbitController:
         if isinstance(safety, Orbiting):
             setpoint = self._orbit.setpoint(seen, safety, self._observer.framing, dt)
             # A setpoint that stands stays at zero: nothing moves by an estimate alone.
-            if setpoint is not None and math.sqrt(setpoint.velocity @ setpoint.velocity) > _STANDING_M_S:
+            # Speed below which a setpoint stands.
+            if setpoint is not None and math.sqrt(setpoint.velocity @ setpoint.velocity) > 0.05:
                 # The autopilot's loop compares it with the velocity that it reports, error included.
                 setpoint = setpoint._replace(velocity=setpoint.velocity + seen.vehicle.velocity_offset)
         elif action == Action.HOLD and isinstance(safety, Requesting | Holding) and safety.position is not None:
@@ -229,7 +226,8 @@ class OrbitController:
         if self._queue.failure(GIMBAL_PITCH):
             self._gimbal_s, self._observer.framing.follows = math.inf, False  # there is no mount: no further requests
         subject, wanted = seen.subject.position, self._config.gimbal_control and self.safety.state == State.ORBITING
-        if wanted and subject is not None and now_s - self._gimbal_s > _GIMBAL_PERIOD_S:
+        # Radius and height change slowly: two pitches of the mount a second will do.
+        if wanted and subject is not None and now_s - self._gimbal_s > 0.5:
             drop = float(seen.vehicle.position[2] - subject[2])
             pitch = -math.degrees(math.atan2(drop, max(seen.subject.distance_m, 0.1)))
             nan = math.nan

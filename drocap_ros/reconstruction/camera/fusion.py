@@ -35,8 +35,7 @@ from drocap_ros.reconstruction.world.even_capture import at_all_slots, capture_p
 from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, turned_at_once
 
-#: Slots of one adjustment: two minutes at 24 Hz, which bounds memory; and those that neighbours share, ten seconds:
-#: where GPS wanders, two windows differ by some decimetres.
+#: Slots that neighbouring windows share, ten seconds: where GPS wanders, two windows differ by some decimetres.
 _OVERLAP = 240
 #: Errors that the second adjustment expects of telemetry worse than configured: those of GPS and of a cheap gimbal.
 _WIDE = CameraErrors(tilt_deg=1.0, position_wander_m=0.5, attitude_wander_deg=0.3)

@@ -84,9 +84,6 @@ def articulation_term(s: np.ndarray) -> tuple[float, np.ndarray]:
     return float(np.vdot(excess, excess)), LIMBS.T @ limbs
 
 
-#: Window length for which alpha is given: the protocol's 10 s at 24 fps.
-REFERENCE_FRAMES = 240
-
 #: Windows of fewer frames are not adjusted: their views are too similar.
 MIN_WINDOW = 4
 
@@ -171,7 +168,8 @@ def effective_alpha(projection: Projection, config: BundleAdjusterConfig) -> flo
     frames, p = w.shape[:2]
     hiding = 2.0 * noise_std(w, information) * (np.sqrt(frames) + np.sqrt(2.0 * p)) if config.noise_alpha > 0.0 else 0.0
     most = 0.1 * float(np.linalg.norm(projection.w.reshape(-1, frames), 2))
-    return float(max(config.alpha * np.sqrt(frames / REFERENCE_FRAMES), min(config.noise_alpha * hiding, most)))
+    # Window length for which alpha is given: the protocol's 10 s at 24 fps.
+    return float(max(config.alpha * np.sqrt(frames / 240), min(config.noise_alpha * hiding, most)))
 
 
 def bundle_adjust(

@@ -21,10 +21,6 @@ from drocap_ros.reconstruction.paper.reprojection import Projection, frames_firs
 
 #: Candidates of K in the rank 3K of the factorization.
 BASIS_SHAPES = (2, 3)
-#: Proximal gradient steps of the metric upgrade, chosen by hand.
-_TRACE_STEPS = 300
-#: Gauss-Newton steps of its refinement, chosen by hand.
-_REFINING_STEPS = 30
 #: Two orthographic images fix no rotation.
 MIN_IMAGES = 3
 #: Of depth: what a factorization leaves open.
@@ -120,7 +116,8 @@ def metric_upgrade(motion: np.ndarray) -> np.ndarray:
     step = 1.0 / np.linalg.norm(gram, 2)
     q = ahead = np.eye(rank) / rank
     t, trace_weight = 1.0, 1e-3
-    for _ in range(_TRACE_STEPS):
+    # Proximal gradient steps of the metric upgrade, chosen by hand.
+    for _ in range(300):
         slope = (gram @ ahead.ravel() - moment).reshape(rank, rank)
         values, vectors = np.linalg.eigh(_symmetric(ahead - step * slope))
         new = (vectors * np.maximum(values - step * trace_weight, 0.0)) @ vectors.T
@@ -151,7 +148,8 @@ def _refine_upgrade(g: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
     gap, jac = residuals(g)
     damping = 1e-2
-    for _ in range(_REFINING_STEPS):
+    # Gauss-Newton steps of its refinement, chosen by hand.
+    for _ in range(30):
         hessian = jac.T @ jac
         move = np.linalg.solve(
             hessian + damping * (np.trace(hessian) / len(hessian)) * np.eye(len(hessian)), jac.T @ gap

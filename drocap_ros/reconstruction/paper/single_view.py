@@ -9,9 +9,6 @@ from drocap_ros.reconstruction.paper.dictionary import Dictionary, sparse_code
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.paper.viewpoint_search import SparseFit, fit_sparse, search_viewpoints
 
-#: Area over which gross outliers are uniform, squared 2D std: about that of the person's box.
-OUTLIER_AREA = 12.0
-
 
 def initialize(
     w: np.ndarray, information: np.ndarray, dictionary: Dictionary, config: InitializerConfig
@@ -94,7 +91,8 @@ def expected_information(
     outlier_share : prior probability of an outlier
     """
     fit = _log_density(projected - w, information / std**2)
-    inlier = _share(fit + np.log1p(-outlier_share), np.log(outlier_share / OUTLIER_AREA))
+    # Area over which gross outliers are uniform, squared 2D std: about that of the person's box.
+    inlier = _share(fit + np.log1p(-outlier_share), np.log(outlier_share / 12.0))
     expected: np.ndarray = information * inlier[..., None]
     return expected
 

@@ -93,8 +93,6 @@ def _shapes(basis: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 #: Poses fitted in one batch: their Jacobians fit the processor's cache.
 CHUNK = 256
-#: Spread of the scale in the first half of the steps, over the configured one; chosen by hand.
-_LOOSE = 3.0
 
 
 @dataclass(frozen=True)
@@ -159,7 +157,8 @@ def search_viewpoints(
     scale = image_scale(w, information, dictionary)
     coefficients[:, 0] = scale
     # The scale is common to the sequence: fit it loosely first, then hold the frames to their median.
-    loose = search.fit(rotation, coefficients, scale, _LOOSE * config.scale_std, half)
+    # Spread of the scale in the first half of the steps, over the configured one; chosen by hand.
+    loose = search.fit(rotation, coefficients, scale, 3.0 * config.scale_std, half)
     best = np.argmin(loose.cost.reshape(count, frames), axis=0)
     scale = float(np.median(loose.coefficients.reshape(count, frames, -1)[best, np.arange(frames), 0]))
     fit = search.fit(loose.rotation, loose.coefficients, scale, config.scale_std, config.search_iterations - half)

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from pymavlink.DFReader import DFMessage
 
-#: UTC in s from which a time is one of a GPS (2001); before its first fix the reader counts from 1970.
-_EARLIEST_UTC_S = 1e9
 #: message -> fields used
 _FIELDS = {
     "ATT": ("Roll", "Pitch", "Yaw"),
@@ -43,7 +41,6 @@ _FIELDS = {
 _PARAMETER = "PARM"
 #: ArduPilot's parameter for the kind of a mount, by its number from 1 on; of the first one also without a number.
 _MOUNT_TYPE = re.compile(r"MNT(\d?)_TYPE")
-_SERVOS = 1  # of that parameter
 #: ... for the mount of the first camera, from 1 on; 0 = the first.
 _CAMERA_MOUNT = "CAM1_MNT_INST"
 
@@ -90,14 +87,16 @@ class _Content:
     def take(self, message: DFMessage) -> None:
         name = message.get_type()
         if name == _PARAMETER:
-            if (mount := _MOUNT_TYPE.fullmatch(message.Name)) and message.Value == _SERVOS:
+            # The kind 1 is servos.
+            if (mount := _MOUNT_TYPE.fullmatch(message.Name)) and message.Value == 1:
                 self.servos.add(int(mount[1] or 1))
             elif message.Name == _CAMERA_MOUNT:
                 self.camera_mount = int(message.Value)
             return
         values = (float(getattr(message, field, np.nan)) for field in _FIELDS[name])
         self.rows[name].append((float(message.TimeUS), *values))
-        if name == "ATT" and message._timestamp > _EARLIEST_UTC_S:
+        # UTC in s from which a time is one of a GPS (2001); before its first fix the reader counts from 1970.
+        if name == "ATT" and message._timestamp > 1e9:
             self.utc_us.append(message._timestamp * 1e6 - message.TimeUS)
 
     def series(self, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -33,8 +33,6 @@ CODE = "gpmd"
 #: Types of numbers and their codes of ``struct``.
 _CODES = {"b": "b", "B": "B", "s": "h", "S": "H", "l": "i", "L": "I", "f": "f", "d": "d", "j": "q", "J": "Q"}
 _DEEPEST = 4
-#: Seconds of a sample where no later one shows them.
-_SAMPLE_S = 1.0
 
 
 def read_gpmf(path: Path, number: int) -> TelemetryLog:
@@ -48,7 +46,8 @@ def read_gpmf(path: Path, number: int) -> TelemetryLog:
     counts = [len(fixes) for fixes in places]
     if not 0 < sum(counts) <= MAX_FRAMES:
         raise InputError(f"{path}: expected positions in the GoPro track, found none; was GPS on? give a log beside it")
-    ends = [*stamps[1:], stamps[-1] + round(_SAMPLE_S * 1e9)]
+    # Seconds of a sample where no later one shows them.
+    ends = [*stamps[1:], stamps[-1] + 10**9]
     at = [start + (end - start) * np.arange(n) // max(n, 1) for start, end, n in zip(stamps, ends, counts, strict=True)]
     stamp_ns, place = np.concatenate(at).astype(np.int64), np.concatenate(places)
     found, lacks = plausible(path, Series.of_places(stamp_ns, place))

@@ -18,8 +18,6 @@ from drocap_ros.simulation.vehicle.mavlink_vehicle import ESTIMATOR_HEALTHY, Enc
 from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
 
 _STEP_S = 0.1  # of the fitted processes; between their steps the errors are interpolated
-_SETTLED = 600  # steps from zero: several times the longest correlation, 13 s
-_YAW_WANDERS_S = 20.0  # within 10 to 60 s: recorded
 _DEAD_RECKONING_M_S = np.array([0.15, 0.075, 0.0])  # drift without satellites
 
 
@@ -40,7 +38,8 @@ class EstimateError:
         self._correlation = np.array([axis.correlation for axis in axes])
         self._now, self._before = np.zeros((3, 2)), np.zeros((3, 2))
         self._part = 0.0
-        for _ in range(_SETTLED):
+        # From zero it takes several times the longest correlation, 13 s.
+        for _ in range(600):
             self._advance()
         self._between: np.ndarray = self._before  # (3, 2) of position and velocity per axis, now
 
@@ -64,7 +63,8 @@ class EstimateError:
         self._between = (1.0 - self._part) * self._before + self._part * self._now
         if dead_reckoning:
             self.glitch = self.glitch + _DEAD_RECKONING_M_S * dt
-        share = math.exp(-dt / _YAW_WANDERS_S)
+        # It wanders within 10 to 60 s: recorded.
+        share = math.exp(-dt / 20.0)
         push = float(self._yaw_rng.standard_normal()) if self.yaw_sd else 0.0
         self.yaw = share * self.yaw + self.yaw_sd * math.sqrt(1.0 - share**2) * push
 

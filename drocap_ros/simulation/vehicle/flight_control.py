@@ -13,12 +13,10 @@ from drocap_ros.flight.autopilot.autopilot import Simulated
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
 
 MAX_LEAN_M_S2 = 5.66  # 30 degrees
-_YAW_GAIN = 5.8  # 1/s: yaw errors of recorded orbits
 _CLIMB_GAIN = 1.0  # 1/s of the height; this and the next two as ArduPilot ships
 _CLIMB_RATE_GAIN = 4.0  # 1/s of the climb
 _MAX_CLIMB_M_S = 2.5  # as ArduPilot ships
 _MAX_CLIMB_M_S2 = 3.0  # assumed
-_FILTER_HZ = 5.0  # of the velocity's error: PSC_NE_VEL_FLTE as shipped
 
 
 @dataclass
@@ -106,7 +104,8 @@ class FlightControl:
         """rad/s."""
         rate = self.target.yaw_rate
         if self.target.yaw is not None:
-            rate += _YAW_GAIN * math.remainder(self.target.yaw - yaw, 2 * math.pi)
+            # The gain, 1/s, gives the yaw errors of recorded orbits.
+            rate += 5.8 * math.remainder(self.target.yaw - yaw, 2 * math.pi)
         return rate
 
     def _shape(self, here: tuple[float, float], expired: bool, dt: float) -> None:
@@ -174,7 +173,8 @@ class FlightControl:
 
 def filter_share(dt: float) -> float:
     """Share of a new value in a low pass of 5 Hz, which both autopilots have."""
-    return dt / (dt + 1 / (2 * math.pi * _FILTER_HZ))
+    # 5 Hz: PSC_NE_VEL_FLTE as shipped.
+    return dt / (dt + 1 / (2 * math.pi * 5.0))
 
 
 def limited(x: float, y: float, most: float) -> tuple[float, float]:
@@ -190,9 +190,6 @@ def rooted(x: float, y: float, gain: float, most: float) -> tuple[float, float]:
         return gain * x, gain * y
     rate = math.sqrt(2 * most * (error - near / 2))
     return x * rate / error, y * rate / error
-
-
-_MAX_M_S = 10.0  # of the path: WP_SPD as shipped
 
 
 def control_of(autopilot: Autopilot, position: np.ndarray, yaw: float, drag: np.ndarray) -> FlightControl:
@@ -279,7 +276,8 @@ class ContinuedControl(FlightControl):
         if target.position is not None:
             # Jerk over acceleration is the gain for the velocity, half of it that for the place.
             x, y = (float(target.position[i]) - self.place[i] for i in (0, 1))
-            closing = limited(*rooted(x, y, 0.5 * jerk / most, 0.5 * most), _MAX_M_S)
+            # 10 m/s: WP_SPD as shipped.
+            closing = limited(*rooted(x, y, 0.5 * jerk / most, 0.5 * most), 10.0)
             ahead = ahead[0] + closing[0], ahead[1] + closing[1]
         ahead = limited(*rooted(*ahead, jerk / most, jerk), most)
         forward = float(target.acceleration[0]), float(target.acceleration[1])

@@ -91,7 +91,6 @@ def orbit_path(seconds: float, radius_m: float = 6.0, height_m: float = 2.5, spe
 Encode = Callable[[float, VehiclePose], mavlink.MAVLink_message | None]
 #: Latitude deg, longitude deg, altitude m of the local frame's origin.
 HOME = np.array([47.397742, 8.545594, 488.0])
-_CURRENT_MODE_S = 0.5  # an autopilot publishes its state so often, and every change at once: measured
 ESTIMATOR_HEALTHY = 831  # flags of both autopilots in the air: recorded
 _GIMBAL_FLAGS = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
 _GIMBAL_EARTH = _GIMBAL_FLAGS | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
@@ -317,7 +316,8 @@ class SimulatedVehicle:
     def _current_mode(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message | None:
         sent_s, before = self._mode_sent
         present = self._present_modes()
-        if present == before and t_s - sent_s < _CURRENT_MODE_S:
+        # An autopilot publishes its state so often, and every change at once: measured.
+        if present == before and t_s - sent_s < 0.5:
             return None
         self._mode_sent = t_s, present
         return CurrentMode(0, *present)

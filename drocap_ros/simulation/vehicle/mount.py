@@ -13,7 +13,6 @@ from drocap_ros.geometry.rotations import quaternion_multiply
 #: By the value of ArduPilot's MNT1_TYPE.
 MOUNT_TYPES = {"fixed": 0, "servo": 1, "gimbal": 6}
 _LIMITS_DEG = (-90.0, 30.0)
-_SERVO_LAG_S = 0.06  # s: a hobby servo turns 60 deg in 0.1 to 0.2 s; assumed
 
 
 class SimulatedMount:
@@ -43,7 +42,8 @@ class SimulatedMount:
             return
         demanded = self._demanded(body_xyzw())
         before = demanded if self._tilt is None else self._tilt
-        self._tilt = before + (demanded - before) * (1 - math.exp(-dt / _SERVO_LAG_S))
+        # A hobby servo turns 60 deg in 0.1 to 0.2 s; its lag of 0.06 s is assumed.
+        self._tilt = before + (demanded - before) * (1 - math.exp(-dt / 0.06))
 
     def camera(self, body_xyzw: np.ndarray) -> np.ndarray:
         """(4,) camera FLU -> ENU, truth, on a body (4,) FLU -> ENU."""
