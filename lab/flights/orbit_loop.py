@@ -25,13 +25,13 @@ from drocap_ros.flight.orbit.states import Action, Command, CommandAnswer, Opera
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.simulation.keypoint_errors import detect_person
-from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 from drocap_ros.simulation.vehicle.mount import SimulatedMount
+from lab.simulation.keypoint_errors import detect_person
 
 EPOCH_NS = 1_700_000_000_000_000_000
 _STEP_S = 0.01

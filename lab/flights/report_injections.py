@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.simulation.orbit_camera import pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from lab.flights.fault_flight import FAULT_S, Injection
 from lab.flights.orbit_loop import OrbitLoop
 

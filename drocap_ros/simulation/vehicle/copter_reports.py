@@ -188,7 +188,7 @@ class ReportingCopter(SimulatedVehicle):
     def __init__(self, transport: Transport, position: np.ndarray, yaw: float, setup: CopterSetup) -> None:
         self.mount = setup.mount or SimulatedMount()
         self._fix_s, self._estimator_s, self._origin_s = setup.ready_s
-        super().__init__(transport, None, setup.autopilot, gimbal=self.mount.kind != "fixed")
+        super().__init__(transport, setup.autopilot, gimbal=self.mount.kind != "fixed")
         if self.kind.mount_type_setting:
             self.settings[self.kind.mount_type_setting] = float(MOUNT_TYPES[self.mount.kind])
         self.body = Body(position, yaw, np.array(setup.wind, float), self.simulated.airframe, setup.seed)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.simulation.orbit_camera import project, to_camera
+from drocap_ros.simulation.pinhole import project, to_camera
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Standard deviation over the box height, per kind of joint (detectors are worst at the ends of the limbs).
