@@ -38,7 +38,7 @@ BUDGETS = {
     ("export", "report", "view"): 4.46,  # OpenSim, USD and FBX (0.17), a report of several persons, the video beside it
     ("ros", "nodes", "bringup"): 4.52,  # lockstep and processes of their own
     ("cli",): 4.77,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06, and 0.11 of perception)
-    ("lab", "benchmarks"): 12.26,  # flights that are drawn (0.35), mutants (0.17), heights (0.08), simulated recordings (0.5)
+    ("lab", "benchmarks"): 12.26,  # flights that are drawn (0.35), mutants (0.17), heights (0.08), recordings (0.5)
 }  # fmt: skip
 #: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.
 AUTOPILOT_WORD = re.compile(
