@@ -32,10 +32,10 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
-from drocap_ros.simulation.orbit_camera import project, to_camera
+from drocap_ros.simulation.pinhole import project, to_camera
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
 from drocap_ros.tracks import Tracks
+from lab.simulation.capture import SimulationConfig, simulate_capture
 from lab.studies.calibration import calibration_markdown, calibration_study
 from lab.studies.live_study import live_study
 from lab.studies.live_study_table import live_markdown

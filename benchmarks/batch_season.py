@@ -17,8 +17,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test" / "helpers")]
 
 def make_season(folder: Path, count: int, seconds: float) -> tuple[int, int]:
     """Tracks, half of them without telemetry; each tenth a video; each twentieth broken.  (good, broken)"""
-    from drocap_ros.simulation.capture import simulate_capture
     from drocap_ros.tracks import save_tracks
+    from lab.simulation.capture import simulate_capture
 
     folder.mkdir()
     broken = count // 20

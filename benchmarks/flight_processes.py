@@ -33,8 +33,7 @@ from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.simulation.keypoint_errors import noisy_keypoints
-from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
@@ -42,6 +41,7 @@ from drocap_ros.simulation.vehicle.loopback import free_udp_port
 from lab.flights.fault_causes import TIMEOUT
 from lab.flights.fault_flight import EXCURSION_M, MOTION_S, Bounds
 from lab.flights.orbit_loop import LoopSettings
+from lab.simulation.keypoint_errors import noisy_keypoints
 
 RATE_HZ, WIDTH, HEIGHT, FIELD_DEG = 15.0, 1280, 720, 60.0
 CONTROL = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}

@@ -137,7 +137,7 @@ def vehicle(port: int) -> Iterator[None]:
     command = [
         sys.executable,
         "-m",
-        "drocap_ros.simulation.vehicle.mavlink_vehicle",
+        "lab.simulation.path_vehicle",
         "--url",
         f"udpout:127.0.0.1:{port}",
     ]

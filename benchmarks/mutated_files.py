@@ -174,7 +174,7 @@ def _djmd(folder: Path) -> bytes:
 def _capture() -> Any:
     from recorded import START_NS
 
-    from drocap_ros.simulation.capture import simulate_capture
+    from lab.simulation.capture import simulate_capture
 
     return simulate_capture(4, 30, seed=2, start_ns=START_NS)
 

@@ -91,10 +91,10 @@ def synthetic_tracks(frames: int) -> Any:
     """A walking person under an orbiting camera with 3 px of noise; needs no data."""
     import numpy as np
 
-    from drocap_ros.simulation.orbit_camera import orbit_camera
     from drocap_ros.simulation.simulated_person import simulate_person
     from drocap_ros.skeleton import BODY_15
     from drocap_ros.tracks import Tracks
+    from lab.simulation.orbit import orbit_camera
 
     t = np.arange(frames) / 24.0
     person = simulate_person(t, action="walk", seed=0)

@@ -21,7 +21,7 @@ def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
     from drocap_ros.perception.sources.image_files import encode_jpeg
     from drocap_ros.ros.conversions import header_at, pose2d_to_ros
     from drocap_ros.ros.topics import TOPICS
-    from drocap_ros.simulation.capture import simulate_capture
+    from lab.simulation.capture import simulate_capture
 
     tracks = simulate_capture(2.0, 30.0, 0).tracks
     rng = np.random.default_rng(0)

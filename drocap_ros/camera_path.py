@@ -11,10 +11,6 @@ from enum import Enum, auto
 
 import numpy as np
 
-#: Deviation (deg) of up below which a method sees it.  Ground under the feet has 0.5, feet alone 3: with such an up the
-#: knees of a still camera's video were bent by 8 degrees more than without.
-_SURE_UP_DEG = 2.0
-
 
 class Teller(Enum):
     """Source of what is known of a camera."""
@@ -187,7 +183,9 @@ class CameraPath:
     @property
     def upright(self) -> bool:
         """Whether up is sure enough for a method to see the rotation: one that is not bends bodies."""
-        return self.errors is not None and self.up_std_deg < _SURE_UP_DEG
+        # Deviation (deg) of up below which a method sees it.  Ground under the feet has 0.5, feet alone 3: with such an
+        # up the knees of a still camera's video were bent by 8 degrees more than without.
+        return self.errors is not None and self.up_std_deg < 2.0
 
     @property
     def stands_on_points(self) -> bool:

@@ -42,12 +42,8 @@ HEIGHT_STD_M = 0.1
 MOVING, MOVING_LOCKED = 0.5, 0.12
 #: Images over which the speed of a foot is averaged: in single steps false contacts set the scale off by 6 %.
 _AVERAGE_IMAGES = 3
-#: Time (s) for which a foot that is not seen keeps its contact: a quarter of a cycle of walking.
-_HIDDEN_S = 0.25
 #: Bounds of the lifter's probability: neither a foot in contact nor a moving one depends on it alone.
 _LEAST_SURE, _MOST_SURE = 0.01, 0.99
-#: Probability of the lifter from which both feet look at rest together.
-_BOTH_REST = 0.8
 #: Least standard deviation (m/s) of the speed at which two resting feet seem to part: the median of demo sessions,
 #: where one of them moves it is 0.3.
 _PARTING_STD_M_S = 0.07
@@ -128,7 +124,8 @@ def ankles_seen(seen: np.ndarray, fps: float) -> np.ndarray:
     """(F, 2) whether a network saw the ankle, of joints (F, P), at the frame or shortly before or after it."""
     from scipy.ndimage import maximum_filter1d
 
-    return np.asarray(maximum_filter1d(seen[:, ANKLES], 2 * round(_HIDDEN_S * fps) + 1, axis=0, mode="nearest"))
+    # Time (s) for which a foot that is not seen keeps its contact: a quarter of a cycle of walking.
+    return np.asarray(maximum_filter1d(seen[:, ANKLES], 2 * round(0.25 * fps) + 1, axis=0, mode="nearest"))
 
 
 def parting_speed(joints: np.ndarray, fps: float) -> np.ndarray:
@@ -170,7 +167,8 @@ def rest_spans(foot: np.ndarray, rate_hz: float) -> list[tuple[int, int]]:
 
 def _resting_together(looks: np.ndarray, parting: np.ndarray) -> np.ndarray:
     """(F - 1, 2) likelihood that resting ankles, and toes, part so fast; 1 where not both feet look at rest."""
-    at_rest = looks.min(axis=1) > _BOTH_REST
+    # Probability of the lifter from which both feet look at rest together.
+    at_rest = looks.min(axis=1) > 0.8
     if not at_rest.any():
         return np.ones(parting.shape)
     std = np.maximum(_PARTING_STD_M_S, _PARTING_OF_MEDIAN * np.median(parting[at_rest], axis=0))

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-#: Least likeness of words: one letter of four is wrong.  At difflib's own 0.6 `--wrong` is like `--config`.
-_ALIKE = 0.75
-
 
 class DrocapError(Exception):
     """Root of the errors that drocap_ros raises; a command ends with status 1."""
@@ -40,5 +37,6 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A question that ends an error's text, ``; did you mean KNOWN?``, or nothing where no known word is alike."""
     from difflib import get_close_matches
 
-    near = get_close_matches(word, list(known), 1, _ALIKE)
+    # Least likeness of words: one letter of four is wrong.  At difflib's own 0.6 `--wrong` is like `--config`.
+    near = get_close_matches(word, list(known), 1, 0.75)
     return f"; did you mean {near[0]}?" if near else ""

@@ -8,11 +8,6 @@ from pathlib import Path
 
 from drocap_ros.errors import InputError
 
-#: Bytes that are looked at: twenty packets of a transport stream, which may begin anywhere in one.
-_HEAD = 4096
-#: Share of printable bytes from which a file is text: of UTF-8 in any language.
-_TEXT_SHARE = 0.85
-
 
 class FileKind(Enum):
     """Kinds of files; the value is their name in messages."""
@@ -59,7 +54,8 @@ def file_kind(path: Path) -> FileKind:
     """Kind of a file."""
     try:
         with path.open("rb") as file:
-            head = file.read(_HEAD)
+            # Bytes that are looked at: twenty packets of a transport stream, which may begin anywhere in one.
+            head = file.read(4096)
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; {error.strerror or error}") from None
     if not head:
@@ -97,4 +93,5 @@ def unpacking(path: Path) -> str:
 
 def _is_text(head: bytes) -> bool:
     printable = sum(byte >= 0x20 or byte in b"\t\n\r\x1b" for byte in head)
-    return printable >= _TEXT_SHARE * len(head) and b"\0" not in head
+    # Share of printable bytes from which a file is text: of UTF-8 in any language.
+    return printable >= 0.85 * len(head) and b"\0" not in head

@@ -19,16 +19,12 @@ _RIGHT = np.array([BODY_15.index("rknee"), BODY_15.index("rankle")])
 _BELOW = ("knee", "ankle", "toe", "heel")
 _HIPS = np.array([BODY_15.index("lhip"), BODY_15.index("rhip")])
 
-#: Standard deviation of a leg joint's step relative to the hips between two images, share of the box.
-_STEP_SIGMA = 0.04
 #: Bound on the cost of one joint's step: a gross error carries no information about sides.
 _MOST_COST = 8.0
 #: Cost of the second hypothesis, per pair of joints and unit of -log(1 - confidence).
 _CONTRADICTION = 0.12
 #: Gap after which the positions of the legs carry no information.
 _LONGEST_GAP_S = 0.25
-#: Factor on the confidence of an exchanged joint, which the network named wrongly.
-_EXCHANGED_CONFIDENCE = 0.85
 
 
 def with_own_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.ndarray) -> Keypoints2D:
@@ -66,7 +62,8 @@ def _step_costs(xy: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> n
     relative = xy - xy[:, _HIPS].mean(axis=1, keepdims=True)
     left, right = relative[:, _LEFT], relative[:, _RIGHT]
     out = np.zeros((len(xy), 2))
-    scale = (_STEP_SIGMA * np.maximum(box_size[1:], 1.0))[:, None]
+    # Standard deviation of a leg joint's step relative to the hips between two images, share of the box.
+    scale = (0.04 * np.maximum(box_size[1:], 1.0))[:, None]
 
     def cost(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         squared = np.square((b[1:] - a[:-1]) / scale[..., None]).sum(axis=2)
@@ -90,7 +87,8 @@ def exchange_legs(keypoints: Keypoints2D, exchanged: np.ndarray) -> Keypoints2D:
         for part in _BELOW:
             if side + part in names:
                 order[names.index(side + part)] = names.index(other + part)
-    trust = np.where(order != np.arange(len(names)), _EXCHANGED_CONFIDENCE, 1.0)
+    # Factor on the confidence of an exchanged joint, which the network named wrongly.
+    trust = np.where(order != np.arange(len(names)), 0.85, 1.0)
     confidence, covariance, which = keypoints.confidence, keypoints.covariance, exchanged[:, None]
     return Keypoints2D(
         np.where(which[..., None], keypoints.xy[:, order], keypoints.xy),

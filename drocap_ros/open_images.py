@@ -21,8 +21,6 @@ from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
 
 logger = logging.getLogger(__name__)
 
-#: Standard deviation of the values, of 255, below which a picture shows nothing: noise of a covered lens.
-_BLANK = 1.0
 #: Every such pixel of a row and of a column counts for it.
 _SAMPLING = 8
 
@@ -83,7 +81,8 @@ def _visible(source: str | Path, frames: Iterable[Frame]) -> Iterator[Frame]:
 
 def is_blank(image: np.ndarray) -> bool:
     """Whether an image (H, W, 3) uint8 shows nothing."""
-    return float(image[::_SAMPLING, ::_SAMPLING].std()) < _BLANK
+    # Standard deviation of the values, of 255, below which a picture shows nothing: noise of a covered lens.
+    return float(image[::_SAMPLING, ::_SAMPLING].std()) < 1.0
 
 
 def refuse_other_inputs(path: Path) -> None:

@@ -221,8 +221,6 @@ _EXTRAPOLATED_CONFIDENCE = 0.85
 SHOULDERS_OUTWARDS = 1.2
 #: Standard deviation of that shift, share of it: people and views differ more than these videos.
 _SHIFT_SPREAD = 0.5
-#: Least length of the line, share of the person's box: a view from above shortens it.
-_LEAST_LINE = 0.05
 
 _SIDES = (("l", "left_"), ("r", "right_"))
 _LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -320,7 +318,8 @@ class JointMap:
         parts = np.where(moved, self.weights + self.outwards, self.weights)
         out_covariance = parts**2 @ np.nan_to_num(covariance)
         out_covariance += _SHIFT_SPREAD**2 * shift[..., [0, 0, 1]] * shift[..., [0, 1, 1]]
-        length = np.maximum(np.linalg.norm(self.lines @ points, axis=-1), _LEAST_LINE * np.asarray(box_size)[..., None])
+        # Least length of the line, share of the person's box: a view from above shortens it.
+        length = np.maximum(np.linalg.norm(self.lines @ points, axis=-1), 0.05 * np.asarray(box_size)[..., None])
         extra = np.where(self.spread > 0, (self.spread * length) ** 2, 0.0)
         out_covariance = out_covariance + extra[..., None] * np.array([1.0, 0.0, 1.0])
         out_covariance[np.isnan(out[..., 0])] = np.nan

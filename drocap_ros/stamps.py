@@ -9,8 +9,6 @@ from drocap_ros.errors import InputError
 NS = 10**9  # nanoseconds of a second
 #: Longest time from the first to the last frame, ns: a year. More is no recording, and overflows.
 _LONGEST_NS = 365 * 86_400 * NS
-#: A stamp this far from the previous one belongs to another time.
-JUMP_S = 3600.0
 #: Successive stamps of another time after which the stream has moved there: a replay began, a clock was set.
 CONFIRMED_AFTER = 5
 
@@ -45,7 +43,8 @@ class StampValidator:
 
 
 def _far(a_ns: int, b_ns: int) -> bool:
-    return abs(a_ns - b_ns) > JUMP_S * 1e9
+    # A stamp this far from the previous one belongs to another time.
+    return abs(a_ns - b_ns) > 3600.0 * 1e9
 
 
 def check_stamps(stamp_ns: np.ndarray) -> None:

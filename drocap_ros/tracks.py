@@ -29,9 +29,6 @@ _NAMED = 5  # of them in a message
 _NORMALISED = 2.0
 #: Share of the picture's size beyond its edge at which networks still place joints of a person who is cut off.
 _OUTSIDE = 0.1
-#: Share of keypoints outside the picture along each axis from which they are none of it, as 3D poses about the hips: a
-#: person who is cut off is so at one side.
-_MOST_OUTSIDE = 0.2
 #: Scores a little above 1 are usual; COCO's flags end at 2.
 _HIGHEST_SCORE = 2.0
 #: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
@@ -330,7 +327,9 @@ def without_unseen(path: Path, xy: np.ndarray, size: np.ndarray) -> np.ndarray:
         return xy
     placed = np.isfinite(xy).all(axis=2) & (xy != 0).any(axis=2) & (xy != -1).any(axis=2)
     share = (outside & placed[..., None]).sum(axis=(0, 1)) / max(placed.sum(), 1)
-    if share.min() > _MOST_OUTSIDE:
+    # Share of keypoints outside the picture along each axis from which they are none of it, as 3D poses about the hips:
+    # a person who is cut off is so at one side.
+    if share.min() > 0.2:
         raise InputError(
             f"keypoints: expected px of an image of {size[0]}x{size[1]}, found {share.min():.0%} of them outside along"
             " each axis; convert them, from its upper left corner"

@@ -17,10 +17,10 @@ from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.motion import load_motion
 from drocap_ros.recording.video_telemetry import Telemetry
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import load_tracks, save_tracks
+from lab.simulation.capture import simulate_capture
 
 
 def python(text, cwd, root):

@@ -34,13 +34,13 @@ BUDGETS = {
     ("reconstruction",): 12.88,  # one engine, one camera; paths by points, live windows; lenses of joined views (0.09)
     ("flight",): 9.25,  # a process that holds after the bridge's death; preflight; heights by every source
     ("recording",): 6.55,  # keypoints of any order (0.45), tables, GPX, GPMF, several in a log; damaged recordings
-    ("simulation",): 3.45,  # reports err as recorded ones
+    ("simulation",): 2.95,  # reports err as recorded ones
     ("evaluation",): 1.08,  # truth from C3D, TRC and BVH by the names of other programs (0.34), one of several bodies
     ("export", "report", "view"): 4.47,  # OpenSim, USD and FBX (0.17), a report of several persons, the video beside it
     ("app",): 1.15,  # the page of clips, corrections and exports
     ("ros", "nodes", "bringup"): 4.52,  # lockstep and processes of their own
     ("cli",): 4.87,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06, and 0.11 of perception)
-    ("lab", "benchmarks"): 11.75,  # flights that are drawn (0.35), mutants of the product (0.17), heights (0.08)
+    ("lab", "benchmarks"): 12.26,  # flights that are drawn (0.35), mutants (0.17), heights (0.08), recordings (0.5)
 }  # fmt: skip
 #: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.
 AUTOPILOT_WORD = re.compile(

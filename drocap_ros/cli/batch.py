@@ -27,10 +27,6 @@ if TYPE_CHECKING:
 
 
 LOG_FILE, PAGE_FILE = "batch.jsonl", "summary.html"
-#: Period of the page while the batch runs, s (docs/batch.md).
-_PAGE_EVERY_S = 60.0
-#: Failures that are printed; the page has all.
-_FAILURES_PRINTED = 10
 #: Names of the temporary folders that killed processes leave.
 _LEFT_OVER = re.compile(r"\.+[\w-]*-[0-9a-f]{16}\.\w+(\.\w+)?")
 
@@ -81,7 +77,8 @@ def run(args: argparse.Namespace) -> int:
         _reconstruct(args, records, todo)
         _remove_left_overs(args.out)
     failures = [record for record in records if record["status"] != "done"]
-    for record in failures[:_FAILURES_PRINTED]:
+    # The page has all failures.
+    for record in failures[:10]:
         print(f"failed: {record['input']}: {record['error']}", file=sys.stderr)
     if not args.quiet:
         print(
@@ -198,7 +195,8 @@ def _reconstruct(args: argparse.Namespace, records: list[Record], todo: list[Tas
                 log.flush()
                 records.append(record)
                 progress("recordings", len(records) / total)
-                if time.monotonic() > saved + _PAGE_EVERY_S:
+                # Period of the page while the batch runs, s (docs/batch.md).
+                if time.monotonic() > saved + 60.0:
                     saved = save_page()
     finally:
         save_page()

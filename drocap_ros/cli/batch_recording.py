@@ -230,8 +230,6 @@ _PRELOAD = (
     "scipy.ndimage",
     "cv2",
 )
-#: Attempts after an unexpected error, such as one of the file system: three in all (docs/batch.md).
-_RETRIES = 2
 #: Longest wait for the scheduler, s; a judgement.
 _CONNECT_S = 20.0
 
@@ -299,7 +297,8 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Generator[Record, Non
         print(f"{len(threads)} workers at {address}, dashboard {client.dashboard_link}", file=sys.stderr)
         if any(count > 1 for count in threads.values()):
             print("workers with several threads use one of them; start them with --nthreads 1", file=sys.stderr)
-        futures = client.map(reconstruct_recording, tasks, pure=False, retries=_RETRIES)
+        # Attempts after an unexpected error, such as one of the file system: three in all (docs/batch.md).
+        futures = client.map(reconstruct_recording, tasks, pure=False, retries=2)
         pending = dict(zip(futures, tasks, strict=True))
         del futures
         for future in as_completed(list(pending)):  # type: ignore[no-untyped-call]

@@ -10,8 +10,6 @@ from drocap_ros.errors import InputError
 
 #: Error (px of a picture 1280 wide) and covered share of the picture beyond which the command says what to do better.
 _POOR_PX, _POOR_COVERED = 1.0, 0.5
-#: Time (s) between two pictures of a film that are looked at: the board has moved meanwhile.
-_STEP_S = 0.3
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -45,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
     with output_file(args.out, inputs=[args.input]) as file:
         source = open_source(str(args.input), ImageIngestConfig())
         try:
-            found = calibrate(source, (int(words[0]), int(words[1])), 0.0 if args.input.is_dir() else _STEP_S)
+            # Time (s) between two pictures of a film that are looked at: the board has moved meanwhile.
+            found = calibrate(source, (int(words[0]), int(words[1])), 0.0 if args.input.is_dir() else 0.3)
         except InputError as error:
             raise InputError(f"{args.input}: {error}") from None
         finally:

@@ -25,10 +25,6 @@ JOINT_GROUPS = {
 }
 #: Frames of W-MPJPE's segments, as in the literature.
 SEGMENT = 100
-#: Mean acceleration (m/s^2) below which a truth is motionless: a person who stands has tenths.
-MOTIONLESS_M_S2 = 1e-3
-#: Squared radius of the ellipsoid that holds 90 % of a normal distribution in three dimensions (chi-squared).
-ELLIPSOID_90 = 6.2514
 #: Frames per second: one number, or (F - 1) of the steps between the frames, which images left out make longer.
 Rate = float | np.ndarray
 FEET = indices(BODY_15.joints, ("rankle", "lankle"))
@@ -140,7 +136,8 @@ def accelerations(joints: np.ndarray, rate_hz: Rate) -> np.ndarray:
 def acceleration_ratio(estimate: np.ndarray, truth: np.ndarray, rate_hz: Rate) -> float:
     """Mean acceleration of the estimated joints over that of the true ones; NaN = the truth does not move."""
     est, tru = (float(np.linalg.norm(accelerations(x, rate_hz), axis=-1).mean()) for x in (estimate, truth))
-    return est / tru if tru > MOTIONLESS_M_S2 else float("nan")
+    # Mean acceleration (m/s^2) below which a truth is motionless: a person who stands has tenths.
+    return est / tru if tru > 1e-3 else float("nan")
 
 
 def acceleration_error(estimate: np.ndarray, truth: np.ndarray, rate_hz: Rate) -> float:
@@ -158,7 +155,8 @@ def ellipsoid_coverage(estimate: np.ndarray, truth: np.ndarray, covariance: np.n
         return float("nan")
     matrix, gap = unpack_covariance(covariance[known]), (estimate - truth)[known]
     square = np.einsum("ni,ni->n", gap, np.linalg.solve(matrix + 1e-12 * np.eye(3), gap[..., None])[..., 0])
-    return float((square < ELLIPSOID_90).mean())
+    # Squared radius of the ellipsoid that holds 90 % of a normal distribution in three dimensions (chi-squared).
+    return float((square < 6.2514).mean())
 
 
 def _of_steps(rate_hz: Rate, frames: int) -> np.ndarray:

@@ -104,10 +104,6 @@ def write_table(path: Path, times_s: np.ndarray, columns: list[str], flat: np.nd
 #: Columns: ISB axes X, Y, Z in the axes of the rigid body (x left, y up, z forwards).
 _ISB = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 _MIRROR = np.diag([1.0, 1.0, -1.0])
-#: Standard deviation in time of the axial rotation of thigh and upper arm, s.
-_AXIAL_S = 0.2
-#: Flexion at which the plane of knee or elbow counts as much as no axial rotation, degrees.
-_CLEAR_DEG = 15.0
 
 
 def write_csv_angles(path: Path, take: Take) -> tuple[str, ...]:
@@ -177,9 +173,11 @@ def _limb(upper: np.ndarray, lower: np.ndarray, bends: float, rate_hz: float) ->
     # Weighted by the squared sine of the flexion, in the complex plane of X and -Z.
     plane = (bent[:, 0] - 1j * bent[:, 2]) * np.abs(bent[:, 0] - 1j * bent[:, 2])
     # The bound keeps invalid stamps (a counter for nanoseconds) from a kernel of 10^9 taps.
-    sigma = min(max(_AXIAL_S * rate_hz, 1e-3), 1000.0)
+    # Standard deviation in time of the axial rotation of thigh and upper arm, s.
+    sigma = min(max(0.2 * rate_hz, 1e-3), 1000.0)
     smooth = gaussian_filter1d(plane.real, sigma) + 1j * gaussian_filter1d(plane.imag, sigma)
-    turn = np.unwrap(np.angle(smooth + np.sin(np.radians(_CLEAR_DEG)) ** 2))
+    # Flexion at which the plane of knee or elbow counts as much as no axial rotation, degrees.
+    turn = np.unwrap(np.angle(smooth + np.sin(np.radians(15.0)) ** 2))
     axes = axes @ Rotation.from_rotvec(turn[:, None] * (0.0, 1.0, 0.0)).as_matrix()
     return axes, _in(axes, lower)
 

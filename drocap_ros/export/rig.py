@@ -21,8 +21,6 @@ from drocap_ros.skeleton import BODY_15, TOES
 
 #: Fading time of the twist that keeps a rotation continuous where a bone points against its rest direction.
 TWIST_FADE_S = 0.5
-#: Cosine between a bone and its rest direction below which the smallest rotation turns too fast.
-_AGAINST = -0.7
 #: Rest poses: angle of the arms below the horizontal, degrees.
 RESTS = {"t": 0.0, "a": 45.0}
 
@@ -46,8 +44,6 @@ SOLE = 0.16  # of the shank; assumed
 #: Length of a hand as a share of the forearm; of what the head's joint is below the crown, of neck to head; assumed.
 _HAND = 0.7
 _CROWN = 0.9  # of neck to head; assumed
-#: Percentile of the lower foot's height that is the floor: the lowest would be an error of one frame.
-_FLOOR_PERCENTILE = 5.0
 
 
 @dataclass(frozen=True)
@@ -136,7 +132,8 @@ def onto_the_floor(body: RigidBody, pelvis: np.ndarray) -> tuple[np.ndarray, str
     if (np.nanmax(pelvis, axis=0) - np.nanmin(pelvis, axis=0)).max() <= ROOT_MOVES_M:
         lowest = np.minimum(lower, body.positions[..., 1].min(axis=1))
         return -lowest, "no root motion known: in each frame the lowest of soles and joints is on the floor"
-    floor = float(np.percentile(lower, _FLOOR_PERCENTILE))
+    # Percentile of the lower foot's height that is the floor: the lowest would be an error of one frame.
+    floor = float(np.percentile(lower, 5.0))
     way = "lowered" if floor > 0 else "raised"
     return np.full(len(lower), -floor), f"floor at 0: {way} by {abs(floor):.3f} m so that the feet stand on it"
 
@@ -234,7 +231,8 @@ def least_rotation(rest: np.ndarray, direction: np.ndarray, rate_hz: float) -> R
     quaternion = (swing[1:].inv() * carried).as_quat()
     jump = 2.0 * np.arctan2(quaternion[:, :3] @ rest, quaternion[:, 3])
     jump = (jump + np.pi) % (2.0 * np.pi) - np.pi
-    against = np.minimum(direction[1:] @ rest, direction[:-1] @ rest) < _AGAINST
+    # Cosine between a bone and its rest direction below which the smallest rotation turns too fast.
+    against = np.minimum(direction[1:] @ rest, direction[:-1] @ rest) < -0.7
     jump = np.where(against, jump, 0.0)
     keep = float(np.exp(-1.0 / (rate_hz * TWIST_FADE_S)))
     twist = lfilter([keep], [1.0, -keep], np.concatenate([[0.0], jump]))

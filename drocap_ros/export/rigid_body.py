@@ -42,16 +42,10 @@ _COLLAR = 0.2
 _BENDS = np.array([0.05, 0.02, 0.02])
 _USUAL = 0.02  # m per radian, as the bends
 _PRIORS = ("neck", "lshoulder", "rshoulder")
-#: Weight of an interpolated joint relative to a known one.
-_INTERPOLATED = 0.02
 #: A joint farther from its position than this, m, gains weight, so that few joints do not bear a frame's whole misfit.
 FAR_M = 0.02
 #: Most rounds of weighing, and steps of one fit: both end before, when it has converged; a judgement.
 _STEPS = 30
-#: Largest change, m or rad, of a fit that has converged; a judgement.
-_CONVERGED = 3e-4
-#: First damping of Levenberg-Marquardt, relative to the diagonal.
-_DAMPING = 1e-6
 #: Frames that are solved together, to bound the memory.
 _CHUNK = 256
 #: Direction of what has none.
@@ -99,7 +93,8 @@ def fit_rigid_body(
     at = {name: measured[:, i] for i, name in enumerate(wanted)}
     problem = _Problem(wanted, _sizes(at, dict(zip(wanted, sure.T, strict=True))))
     start = problem.start(at)
-    weights = np.where(sure, 1.0, _INTERPOLATED)
+    # Weight of an interpolated joint relative to a known one.
+    weights = np.where(sure, 1.0, 0.02)
     parts = [slice(i, i + _CHUNK) for i in range(0, len(positions), _CHUNK)]
     solved = [problem.solve(start.part(p), measured[p], weights[p]) for p in parts]
     pose = _Pose(*(np.concatenate(values) for values in zip(*solved, strict=True)))
@@ -217,7 +212,8 @@ class _Problem:
     def solve(self, pose: _Pose, measured: np.ndarray, weights: np.ndarray) -> _Pose:
         """Levenberg-Marquardt from ``pose`` to the joints ``measured`` (F, P, 3) with ``weights`` (F, P)."""
         scale = np.repeat(weights, 3, axis=1)
-        damping = np.full(len(measured), _DAMPING)
+        # First damping of Levenberg-Marquardt, relative to the diagonal.
+        damping = np.full(len(measured), 1e-6)
         active = np.arange(len(measured))
         pose = _Pose(*(values.copy() for values in pose))
         for _ in range(_STEPS):
@@ -241,7 +237,8 @@ class _Problem:
             better = np.sum(new**2, axis=1) < np.sum(residual**2, axis=1)
             pose.replace(active[better], moved.part(better))
             damping[active] *= np.where(better, 0.1, 100.0)
-            active = active[np.abs(step).max(axis=1) > _CONVERGED]
+            # Largest change, m or rad, of a fit that has converged; a judgement.
+            active = active[np.abs(step).max(axis=1) > 3e-4]
             if not len(active):
                 break
         return pose

@@ -17,10 +17,6 @@ from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.skeleton import indices
 from drocap_ros.tracks import MAX_FRAMES
 
-#: Stamps within this share of a frame of an even time line count as even.
-EVEN_TOLERANCE = 0.05
-#: Times that differ by less than this share of a frame are the same.
-_SAME_FRAME = 1e-3
 #: Names that every format accepts.
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,60}")
 #: glTF skins store a joint in one byte; C3D readers accept no more either.
@@ -112,7 +108,8 @@ def at_constant_rate(take: Take) -> Take:
     """
     times, last = take.times_s, float(take.times_s[-1])
     even_step = last / (len(times) - 1)
-    if np.abs(times - np.arange(len(times)) * even_step).max() <= EVEN_TOLERANCE * even_step:
+    # Stamps within this share of a frame of an even time line count as even.
+    if np.abs(times - np.arange(len(times)) * even_step).max() <= 0.05 * even_step:
         return replace(take, rate_hz=1.0 / even_step)
     count = int(np.floor(last * take.rate_hz + 1e-6)) + 1
     if count > MAX_FRAMES:
@@ -125,7 +122,8 @@ def at_constant_rate(take: Take) -> Take:
     left, span = right - 1, times[right] - times[right - 1]
     share = np.clip((even - times[left]) / span, 0.0, 1.0)
     # A sample on a frame equals that frame, even where its neighbour is unknown or far.
-    on_left, on_right = (np.abs(even - times[i]) * take.rate_hz < _SAME_FRAME for i in (left, right))
+    # Times that differ by less than this share of a frame are the same.
+    on_left, on_right = (np.abs(even - times[i]) * take.rate_hz < 1e-3 for i in (left, right))
     share = np.where(on_left, 0.0, np.where(on_right, 1.0, share))[:, None, None]
     a, b = take.positions[left], take.positions[right]
     mixed = np.where(share <= 0, a, np.where(share >= 1, b, (1 - share) * a + share * b))

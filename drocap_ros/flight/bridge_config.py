@@ -295,6 +295,11 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     )
     gimbal_control: bool = param(False, "whether the mount's pitch follows the subject")
 
+    @property
+    def max_mode_age_s(self) -> float:
+        """Greatest age of the report of the mode at which another one is requested: it is seen in the next step."""
+        return 1.5 / self.control_hz
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if (refusal := height_condition(self, self.height_m)) is not None:

@@ -15,7 +15,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.flight.autopilot.autopilot import UNKNOWN, Autopilot, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode
 
-_TERRAIN_SD_M = 0.5  # of the ground below the vehicle about the subject's
 FIX_3D: int = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
@@ -230,10 +229,11 @@ class Observed:
     def heights(self) -> dict[str, Height]:
         """The vehicle's height above the subject's ground by everything that tells it, the reported one first."""
         ground, clearance_m = self.subject.ground, self.vehicle.clearance_m
+        # The ground below the vehicle differs from the subject's by half a metre.
         heights = {
             "as reported": self.vehicle.height,
             "by the subject's image": Height(float(self.vehicle.position[2]) - ground.m, ground.sd_m),
-            "by the range finder": Height(clearance_m, _TERRAIN_SD_M),
+            "by the range finder": Height(clearance_m, 0.5),
         }
         return {source: height for source, height in heights.items() if math.isfinite(height.m)}
 

@@ -10,10 +10,6 @@ from drocap_ros.camera_path import CameraPath, Teller
 from drocap_ros.geometry.interpolation import MAX_GAP_S, interpolate
 from drocap_ros.geometry.rotations import matrix_from_quaternion, pixels_are_usual, unit_quaternions
 
-#: Poses kept: the longest window at 100 Hz.
-_MOST_POSES = 15_000
-#: Changes of the calibration that are kept; a camera changes its mode a few times a flight.
-_MOST_MATRICES = 20
 #: A stamp further back than this restarts the history; others out of order are left out.
 _LATE_NS = 10**9
 #: Images may be so much older than the newest pose.
@@ -50,7 +46,8 @@ class CameraHistory:
             self._poses.clear()
         self._stamps.append(stamp_ns)
         self._poses.append(pose)
-        old = max(bisect_left(self._stamps, stamp_ns - self._keep_ns), len(self._stamps) - _MOST_POSES)
+        # The poses of the longest window at 100 Hz are kept.
+        old = max(bisect_left(self._stamps, stamp_ns - self._keep_ns), len(self._stamps) - 15_000)
         del self._stamps[:old], self._poses[:old]
 
     def add_matrix(self, stamp_ns: int, matrix: np.ndarray, size: tuple[int, int] = (0, 0)) -> None:
@@ -63,7 +60,8 @@ class CameraHistory:
             return
         last = self._matrices[-1] if self._matrices else None
         if last is None or last[2] != size or not np.array_equal(last[1], matrix):
-            self._matrices = [*self._matrices[1 - _MOST_MATRICES :], (stamp_ns, matrix, size)]
+            # The last changes of the calibration are kept; a camera changes its mode a few times a flight.
+            self._matrices = [*self._matrices[-19:], (stamp_ns, matrix, size)]
 
     def uncalibrated(self, size: tuple[int, int]) -> str:
         """Why images of ``size``, width and height px, have no calibration, as words; "" = they have, or no poses."""

@@ -97,16 +97,19 @@ def smoothed(values: np.ndarray, sigma: float) -> np.ndarray:
     return out
 
 
+def peak(values: np.ndarray, best: int) -> float:
+    """Place of the top of the parabola through three values (N,), in samples from the middle one."""
+    if not 0 < best < len(values) - 1:
+        return 0.0
+    before, here, after = values[best - 1 : best + 2]
+    bend = before - 2.0 * here + after
+    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0
+
+
 #: Smoothing of the path through the steps.
 _SMOOTHING_S = 0.25
-#: A coordinate that changes by less from frame to frame rests: less than any log's rounding.
-_REST_M = 1e-5
 #: Steps in the median: rounded coordinates of 1e-7 deg have 11 mm.
 _STEP_M = 0.005
-#: Least share of the steps that stand alone between frames at rest; a flown path has hardly any.
-_ALONE = 0.2
-#: Fewer steps are no pattern.
-_LEAST_STEPS = 4
 #: Two steps that differ by more are a jump of the log, which stays as it is.
 _JUMP_M = 1.0
 #: Share of the times between reports that are alike where positions are held until the next report.
@@ -121,15 +124,18 @@ def without_steps(position: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
     as they are, bit for bit, and so do those with a jump.
     """
     change = np.diff(position, axis=0)
-    moves = np.abs(change) > _REST_M
+    # A coordinate that changes by less from frame to frame rests: less than any log's rounding.
+    moves = np.abs(change) > 1e-5
     out = position.copy()
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     for axis in range(position.shape[1]):
         at, step = np.flatnonzero(moves[:, axis]), change[moves[:, axis], axis]
-        if len(at) < _LEAST_STEPS or np.median(np.abs(step)) < _STEP_M or np.abs(np.diff(step)).max() > _JUMP_M:
+        # Fewer steps are no pattern.
+        if len(at) < 4 or np.median(np.abs(step)) < _STEP_M or np.abs(np.diff(step)).max() > _JUMP_M:
             continue
         rests = np.pad(~moves[:, axis], 1)
-        if (rests[at] | rests[at + 2]).mean() < _ALONE:
+        # Least share of the steps that stand alone between frames at rest; a flown path has hardly any.
+        if (rests[at] | rests[at + 2]).mean() < 0.2:
             continue
         late_s = _late_s(moves, time)
         passed = 0.5 * (time[at] + time[at + 1]) - late_s

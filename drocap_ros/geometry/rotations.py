@@ -178,10 +178,6 @@ def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array(parts, np.result_type(a, b)) if single else np.stack(parts, axis=-1)
 
 
-#: Least squared half axis: smaller ones are invisible.
-_SMALLEST_M2 = 1e-8
-
-
 def unpack_covariance(packed: np.ndarray) -> np.ndarray:
     """Symmetric matrices (..., 3, 3) of xx xy xz yy yz zz (..., 6)."""
     return packed[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*packed.shape[:-1], 3, 3)
@@ -197,7 +193,8 @@ def ellipsoids(covariance: np.ndarray, sigmas: float) -> tuple[np.ndarray, np.nd
     """Orientation (N, 4) x y z w and half axes (N, 3) m of the ellipsoids of covariances (N, 3, 3) m^2."""
     variances, axes = np.linalg.eigh(covariance)
     axes[np.linalg.det(axes) < 0, :, 0] *= -1.0  # a rotation, not a reflection
-    return quaternion_from_matrix(axes), sigmas * np.sqrt(np.maximum(variances, _SMALLEST_M2))
+    # Least squared half axis: smaller ones are invisible.
+    return quaternion_from_matrix(axes), sigmas * np.sqrt(np.maximum(variances, 1e-8))
 
 
 #: Focal length of a lens of which nothing is known, share of the image's longer side: ``assumed_focal`` says why.

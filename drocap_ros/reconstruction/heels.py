@@ -23,8 +23,6 @@ _USUAL = np.array([-0.3, 0.25])
 _SPREAD = 0.15
 #: Error of a heel in the image at which its weight is a half, in the same unit.
 _OUTLIER = 0.2
-#: Rounds of the robust fit, chosen by hand.
-_ROUNDS = 4
 
 
 def foot_axes(joints: np.ndarray) -> np.ndarray:
@@ -51,7 +49,8 @@ def heel_place(image_joints: np.ndarray, heels: Keypoints2D) -> tuple[np.ndarray
     design = np.swapaxes(axes[seen][..., :2], 1, 2) * factor[:, None, None]
     target = (heels.xy - image_joints[:, _ANKLES, :2])[seen] * factor[:, None]
     place, weight = _USUAL, heels.weights[seen]
-    for _ in range(_ROUNDS):
+    # Rounds of the robust fit, chosen by hand.
+    for _ in range(4):
         error = design @ place - target
         used = weight / np.square(1 + np.square(error).sum(axis=-1) / _OUTLIER**2)
         matrix = np.einsum("nki,n,nkj->ij", design, used, design) + np.eye(2) * (_OUTLIER / _SPREAD) ** 2

@@ -8,6 +8,7 @@ import numpy as np
 
 from drocap_ros.camera_path import CameraPath, Teller
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.camera.fusion import with_measured
 from drocap_ros.reconstruction.camera.picture_world import at_assumed_stature, on_ground, seen_from_camera
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
@@ -39,21 +40,6 @@ class Settings:
         return METHODS[self.method].joints
 
 
-@dataclasses.dataclass(frozen=True)
-class Body:
-    """Poses in m, with the camera: the fields of :class:`Motion` of the same names."""
-
-    joints3d: np.ndarray
-    frame: str
-    metric: bool
-    scale_source: str
-    camera_rotation: np.ndarray
-    camera_position: np.ndarray | None
-    reprojection_px: np.ndarray
-    covariance: np.ndarray | None
-    meta: dict[str, object]
-
-
 def as_seen(camera: CameraPath) -> CameraPath:
     """The camera as far as a method may see it: a rotation whose up is unsure bends bodies."""
     return camera if camera.upright else dataclasses.replace(camera, rotation=None, position=None)
@@ -67,7 +53,7 @@ def by_place(camera: CameraPath) -> bool:
     return camera.lens == "assumed" and as_seen(camera).rotation is None
 
 
-def in_metres(keypoints: Keypoints2D, poses: ImagePoses, camera: CameraPath, settings: Settings) -> Body | Refusal:
+def in_metres(keypoints: Keypoints2D, poses: ImagePoses, camera: CameraPath, settings: Settings) -> Motion | Refusal:
     """The one step from px to m: in the world where the camera's rotation is known, else in the camera's axes.
 
     In the world the poses are placed by the camera and, with its position and matrix, adjusted with it.  The answer
@@ -97,34 +83,40 @@ def in_metres(keypoints: Keypoints2D, poses: ImagePoses, camera: CameraPath, set
         seen = poses if camera.matrix is None or not by_place(camera) else aside(poses, camera.matrix)
         if camera.stands_on_points:
             per_px = on_ground(camera, seen, per_px)
-        placed, refined, refusal = in_world(camera, keypoints, seen, per_px, config_of(camera, config))
-        if refusal is not None:
-            return refusal
+        placed, found = in_world(camera, keypoints, seen, per_px, config_of(camera, config))
+        if isinstance(found, Refusal):
+            return found
+        refined = found
     if camera.teller in (Teller.PICTURE, Teller.PERSON):
         metric = placed.metric and camera.metric
         placed = dataclasses.replace(placed, metric=metric, scale_source=camera.scale_source)
     if placed.scale is not None:
         meta["scale"] = dataclasses.asdict(placed.scale)
-    body = Body(
+    motion = Motion(
         joints3d=np.ascontiguousarray(placed.joints),
+        joints=settings.body.joints,
+        parents=settings.body.parents,
+        stamp_ns=stamp_ns,
         frame=frame,
         metric=placed.metric,
         scale_source=placed.scale_source,
         camera_rotation=rotation,
+        confidence=keypoints.weights,
+        keypoints=keypoints.xy,
         camera_position=camera.position if frame == "world" else None,
         reprojection_px=np.linalg.norm(poses.in_image[..., :2] - keypoints.xy, axis=-1),
         covariance=_covariance(poses, per_px, rotation),
         meta=meta,
     )
     if refined is None:
-        if body.covariance is not None:
+        if motion.covariance is not None:
             meta["covariance_about"] = "pelvis"
-        return body
+        return motion
     refined = _by_camera(refined, camera, settings.adjuster.stature_std)
     meta["calibration"], meta["covariance_about"] = refined.calibration, "origin"
     pose = refined.rotation, refined.position
     return dataclasses.replace(
-        body,
+        motion,
         joints3d=np.ascontiguousarray(refined.joints),
         metric=refined.metric,
         scale_source="telemetry" if refined.metric else "assumed_height",

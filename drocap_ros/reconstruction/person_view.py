@@ -17,8 +17,6 @@ from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.lifter_input import centre_of
 from drocap_ros.tracks import Tracks
 
-#: Standard deviation, frames, of the average of the person's place: the view follows the person, not its noise.
-_AIM_SMOOTHING = 6.0
 #: Share of gravity across the view between which its roll is turned away: seen from straight above there is none.
 _STEEP, _SLANTED = 0.15, 0.35
 #: Least depth of a joint, share of the pelvis': what is nearer is an error of the pose.
@@ -121,7 +119,8 @@ def _place(keypoints: Keypoints2D) -> np.ndarray:
 
     seen = np.where((keypoints.weights > 0.0)[..., None], keypoints.xy, np.nan)
     place = np.where(np.isfinite(seen[:, 0]), seen[:, 0], centre_of(seen[:, :15]))
-    return np.asarray(gaussian_filter1d(place, min(_AIM_SMOOTHING, len(place)), axis=0, mode="nearest"))
+    # Standard deviation, frames, of the average of the person's place: the view follows the person, not its noise.
+    return np.asarray(gaussian_filter1d(place, min(6.0, len(place)), axis=0, mode="nearest"))
 
 
 def _upright(turn: np.ndarray, down: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from drocap_ros.reconstruction.common.engine import blas_threads
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.heels import with_heels
-from drocap_ros.reconstruction.in_metres import Body, Settings, as_seen, by_place, in_metres
+from drocap_ros.reconstruction.in_metres import Settings, as_seen, by_place, in_metres
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.person_view import aside, lens_word, person_view, true_shape, with_lens
@@ -113,15 +113,16 @@ def solve(
         clock.lap("camera", counts=camera.refused or camera.teller is Teller.POINTS_AND_REPORTS)
         poses, camera = body_poses(tracks, keypoints, camera, settings)
         clock.lap("poses")
-        body = in_metres(keypoints, poses, camera, settings)
-        if isinstance(body, Refusal):
+        motion = in_metres(keypoints, poses, camera, settings)
+        if isinstance(motion, Refusal):
             # The lifter saw the camera's rotation: without it the poses differ too.
-            camera = without_reports(camera, str(body))
+            camera = without_reports(camera, str(motion))
             poses, camera = body_poses(tracks, keypoints, camera, settings)
             clock.lap("poses")
-            body = in_metres(keypoints, poses, camera, settings)
-            assert not isinstance(body, Refusal)
-    motion = _motion(tracks, keypoints, body, settings)
+            motion = in_metres(keypoints, poses, camera, settings)
+            assert not isinstance(motion, Refusal)
+    if motion.frame == "world" and motion.camera_position is None:  # an assumed lens has no place, the drone has one
+        motion = dataclasses.replace(motion, camera_position=tracks.camera_position)
     if settings.body is BODY_17:
         motion = with_heels(motion, every_joint.without_joints(len(BODY_17)), poses.in_image)
     clock.lap("world", counts=motion.frame == "world")
@@ -236,19 +237,6 @@ def _solve(tracks: Tracks, keypoints: Keypoints2D, camera: CameraPath, settings:
 def _as_said(resting: np.ndarray, still: np.ndarray | None) -> np.ndarray:
     """(F, 2) probability that a foot rests: as somebody says, else as the method does."""
     return np.where(np.isfinite(resting), resting, 0.5 if still is None else still)
-
-
-def _motion(tracks: Tracks, keypoints: Keypoints2D, body: Body, settings: Settings) -> Motion:
-    if body.frame == "world" and body.camera_position is None:  # an assumed lens has no place, the drone has one
-        body = dataclasses.replace(body, camera_position=tracks.camera_position)
-    return Motion(
-        joints=settings.body.joints,
-        parents=settings.body.parents,
-        stamp_ns=tracks.stamp_ns,
-        confidence=keypoints.weights,
-        keypoints=keypoints.xy,
-        **{field.name: getattr(body, field.name) for field in dataclasses.fields(body)},
-    )
 
 
 class _Clock:

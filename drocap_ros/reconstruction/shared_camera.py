@@ -15,10 +15,6 @@ from drocap_ros.reconstruction.world.refine import RefinedWorld
 _HELD = CameraErrors(0.005, 0.005, 1e-4, position_wander_m=0.002, attitude_wander_deg=0.005)
 #: Standard deviation of the logarithm of a stature: adults' 0.05, and children are among others.
 _STATURE_STD = 0.1
-#: The same of a stature by the ground: the lifter's sizes, as for a path's metres.
-_GROUND_STD = 0.04
-#: Slope (degrees) of ground that looks level.
-_SLOPE_DEG = 2.0
 #: Height (m) of the camera above the ground below which a ray does not tell where it meets the ground.
 _LOW_M = 0.5
 
@@ -63,8 +59,10 @@ def stature(camera: CameraPath, seen: np.ndarray) -> tuple[float, float]:
         return 1.0, _STATURE_STD
     each = np.log(height[tells] / -lower[tells, 2])
     apart = np.linalg.norm((position + lower - camera.feet)[tells, :2], axis=1) / height[tells]
-    tilt = np.deg2rad(np.hypot(camera.up_std_deg, _SLOPE_DEG)) * float(np.median(apart))
-    weights = np.array([1.0 / (_GROUND_STD**2 + tilt**2), 1.0 / _STATURE_STD**2])
+    # Slope (degrees) of ground that looks level.
+    tilt = np.deg2rad(np.hypot(camera.up_std_deg, 2.0)) * float(np.median(apart))
+    # A stature by the ground has the deviation of the lifter's sizes, as a path's metres have.
+    weights = np.array([1.0 / (0.04**2 + tilt**2), 1.0 / _STATURE_STD**2])
     return float(np.exp(weights[0] * np.median(each) / weights.sum())), float(weights.sum() ** -0.5)
 
 

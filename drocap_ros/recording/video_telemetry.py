@@ -23,7 +23,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.flight.vehicle import camera_rotation
-from drocap_ros.geometry.interpolation import interpolate
+from drocap_ros.geometry.interpolation import interpolate, peak
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.perception.calibration import camera_model
 from drocap_ros.perception.sources.base import ImageIngestConfig
@@ -36,19 +36,11 @@ from drocap_ros.tracks import Tracks
 
 #: Sampling rate of the correlation.
 RATE_HZ = 10.0
-#: Part of a video, from its start, that is used.
-MAX_VIDEO_S = 180.0
-#: Shorter videos hold too few turns.
-MIN_VIDEO_S = 5.0
 #: Least correlation, and its least lead over the second best offset.
 MIN_CORRELATION = 0.7
 MIN_LEAD = 0.1  # of the correlation, which is at most 1; a judgement
-#: Least standard deviation of the camera's turning rate in the log.
-MIN_TURN_DEG_S = 1.5
 #: Largest error of the container's creation time; the correlation searches within it.
 CREATION_SLACK_S = 5.0
-#: Largest difference between a video's length and the part of a log that is marked as video.
-PART_SLACK_S = 2.0
 #: Width, px, of the small images of the phase correlation.
 _WIDTH = 160
 
@@ -139,10 +131,11 @@ def _offset_by_creation(video: Path, log: TelemetryLog) -> tuple[float | None, f
 def _offset_by_part(video: Path, log: TelemetryLog, created_s: float | None) -> float | None:
     """Start of the part of the log that lasts as long as the video; of several the one nearest the creation time."""
     _, length_s = stated_times(video)
+    # Largest difference between a video's length and the part of a log that is marked as video.
     starts = [
         (first - int(log.track.stamp_ns[0])) * 1e-9
         for first, last in log.video_parts
-        if length_s is None or abs((last - first) * 1e-9 - length_s) <= max(PART_SLACK_S, 0.05 * length_s)
+        if length_s is None or abs((last - first) * 1e-9 - length_s) <= max(2.0, 0.05 * length_s)
     ]
     if len(starts) > 1 and created_s is not None:
         starts = sorted(starts, key=lambda s: abs(s - created_s))[:1]
@@ -166,7 +159,8 @@ def image_motion(video: Path, progress: Progress | None = None) -> tuple[np.ndar
     try:
         while (frame := source.read()) is not None:
             t = frame.stamp_ns * 1e-9
-            if t > MAX_VIDEO_S:
+            # Part of a video, from its start, that is used.
+            if t > 180.0:
                 break
             if before is not None and t - before[0] < 0.9 / RATE_HZ:
                 continue
@@ -225,7 +219,8 @@ def correlate_turning(
     near_s : only offsets within ``CREATION_SLACK_S`` of this one
     """
     log_t, turning = turning_rate(track, mount_pitch_deg)
-    if len(times) < 2 or times[-1] - times[0] < MIN_VIDEO_S or len(turning) < 2:
+    # Shorter videos hold too few turns.
+    if len(times) < 2 or times[-1] - times[0] < 5.0 or len(turning) < 2:
         return None
     grid = np.arange(times[0], times[-1], 1.0 / RATE_HZ)
     x = _smooth(np.interp(grid, times, motion))
@@ -239,7 +234,8 @@ def correlate_turning(
     mean = (sums[n:] - sums[:-n]) / n
     variance = np.maximum((squares[n:] - squares[:-n]) / n - mean**2, 0.0)
     product = np.correlate(y, x, mode="valid") / n
-    enough = variance > np.deg2rad(MIN_TURN_DEG_S) ** 2
+    # Least standard deviation of the camera's turning rate in the log.
+    enough = variance > np.deg2rad(1.5) ** 2
     fit = np.where(enough, product / np.sqrt(np.maximum(variance * np.mean(x * x), 1e-30)), -1.0)
     # Windows with gaps in the log are excluded.
     holes = np.concatenate([[0], np.cumsum(~np.isfinite(turning))])
@@ -252,21 +248,12 @@ def correlate_turning(
     second = fit[rivals].max(initial=-1.0)
     if fit[best] < MIN_CORRELATION or fit[best] - second < MIN_LEAD:
         return None
-    return float(offset[best] + _peak(fit, best) / RATE_HZ), float(fit[best])
+    return float(offset[best] + peak(fit, best) / RATE_HZ), float(fit[best])
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
     kernel = np.array([0.25, 0.5, 0.25])
     return np.convolve(np.pad(values, 1, mode="edge"), kernel, mode="valid")
-
-
-def _peak(fit: np.ndarray, best: int) -> float:
-    """Vertex of the parabola through three neighbours, in steps from the middle one."""
-    if not 0 < best < len(fit) - 1:
-        return 0.0
-    a, b, c = fit[best - 1 : best + 2]
-    bend = a - 2 * b + c
-    return float(np.clip(0.5 * (a - c) / bend, -0.5, 0.5)) if bend < 0 else 0.0
 
 
 logger = logging.getLogger(__name__)

@@ -15,9 +15,6 @@ from drocap_ros.recording.keypoints.body_check import is_no_body
 from drocap_ros.report.statistics import Statistics, mean_known
 from drocap_ros.skeleton import TOES
 
-#: So many warnings make a motion doubtful; a judgement.
-_MANY_WARNINGS = 3
-
 
 class Severity(Enum):
     """Consequence of a finding: doubt the motion, or read it with care."""
@@ -189,7 +186,8 @@ def quality_sentence(findings: Sequence[Finding]) -> str:
     warnings = [finding for finding in findings if finding.severity is Severity.WARNING]
     if not warnings:
         return "quality: good, no check doubts this motion"
-    doubtful = len(warnings) >= _MANY_WARNINGS or any(w.check in _DOUBTFUL for w in warnings)
+    # So many warnings make a motion doubtful; a judgement.
+    doubtful = len(warnings) >= 3 or any(w.check in _DOUBTFUL for w in warnings)
     titles = ", ".join(w.title[0].lower() + w.title[1:] for w in warnings)
     return f"quality: {'doubtful' if doubtful else 'fair'}, {len(warnings)} warning{'s'[: len(warnings) > 1]}: {titles}"
 

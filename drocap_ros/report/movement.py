@@ -69,8 +69,6 @@ def flexion_words(joints: np.ndarray, names: tuple[str, ...]) -> str:
     return ", ".join(f"{joint}s {both[0]:.0f} and {both[1]:.0f}" for joint, both in medians.items()) + " degrees"
 
 
-#: Half the time of a speed's mean, s: at walking a hand or foot hardly turns in it, and noise of one image is halved.
-_HALF_S = 0.1
 #: Step of numerical derivatives, m: small beside a bone, large beside the rounding of doubles.
 _STEP_M = 1e-4
 _ANGLES = {
@@ -182,7 +180,9 @@ def _facing(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
 
 def _half_window(times_s: np.ndarray) -> int:
     """Frames before and after each that a speed counts, at least one."""
-    return min(max(1, round(_HALF_S / float(np.median(np.diff(times_s))))), (len(times_s) - 1) // 2)
+    # Half the time of a speed's mean, s: at walking a hand or foot hardly turns in it, and noise of one image is
+    # halved.
+    return min(max(1, round(0.1 / float(np.median(np.diff(times_s))))), (len(times_s) - 1) // 2)
 
 
 def _speed(joints: np.ndarray, times_s: np.ndarray, frames: np.ndarray) -> np.ndarray:

@@ -19,8 +19,6 @@ from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.sources.video import pyav
 from drocap_ros.skeleton import side_of
 
-#: Quality of H.264 (constant rate factor): thin lines stay clean, ten seconds of 720p take a few megabytes.
-_CRF = 20
 #: Rates that players show, images/s, and the greatest denominator of one.
 _RATES_HZ, _DENOMINATOR = (1.0, 120.0), 1_000_000
 
@@ -38,7 +36,8 @@ class VideoFile:
         # Four pixels share a colour, and the index comes first: what browsers and phones expect.
         try:
             self._file = self._av.open(str(path), "w", format="mp4", options={"movflags": "faststart"})
-            self._stream = self._file.add_stream("libx264", rate, options={"preset": "veryfast", "crf": str(_CRF)})
+            # Quality of H.264 (constant rate factor): thin lines stay clean, ten seconds of 720p take a few megabytes.
+            self._stream = self._file.add_stream("libx264", rate, options={"preset": "veryfast", "crf": "20"})
         except self._av.codec.codec.UnknownCodecError:
             raise InputError("H.264: expected PyAV with libx264, found none; install av from PyPI") from None
         except self._av.error.FFmpegError as error:
@@ -72,16 +71,8 @@ class VideoFile:
 
 #: BGR; the sides as in the markers and the viewer.
 _COLOURS = {"left": (255, 160, 40), "right": (60, 60, 255), "middle": (90, 220, 90)}
-#: Radius of the ellipses in standard deviations.
-_SIGMAS = 2.0
 #: Points of the scene and their ways over the last second: magenta, as few scenes have it.
 _POINT, _TRAIL, _TRAIL_NS = (255, 0, 255), (210, 90, 210), 1_000_000_000
-#: Most images of the picture of all persons: four columns fill a screen.
-_MOST_IMAGES = 12
-#: Largest width of each, px.
-_WIDTH_PX = 960
-#: Longer side of the overlay's video, px.
-_VIDEO_PX = 1280
 
 
 def draw(image: np.ndarray, observation: PoseObservation) -> np.ndarray:
@@ -157,7 +148,8 @@ class OverlayVideo:
         import cv2
 
         height, width = frame.image.shape[:2]
-        scale = min(1.0, _VIDEO_PX / max(width, height))
+        # Longer side of the overlay's video, px.
+        scale = min(1.0, 1280 / max(width, height))
         size = (max(2, round(width * scale) // 2 * 2), max(2, round(height * scale) // 2 * 2))
         drawn = frame.image
         if self._trails is not None and observations:
@@ -210,7 +202,8 @@ def _ellipse(
 
     xx, xy, yy = (float(v) for v in covariance)
     values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-    radii = _SIGMAS * np.sqrt(np.maximum(values, 0.25))
+    # Radius of the ellipses in standard deviations.
+    radii = 2.0 * np.sqrt(np.maximum(values, 0.25))
     angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
     at = tuple(int(v) for v in np.round(centre))
     cv2.ellipse(
@@ -236,7 +229,8 @@ def chosen_stamps(persons: Sequence[FoundPerson]) -> list[int]:
 
     left = {person.number for person in persons}
     stamps: list[int] = []
-    while left and len(stamps) < _MOST_IMAGES:
+    # Most images of the picture of all persons: four columns fill a screen.
+    while left and len(stamps) < 12:
         stamps.append(max(there, key=partial(worth, left=left)))
         left = left - there[stamps[-1]].keys()
     return sorted(stamps)
@@ -257,7 +251,8 @@ def persons_picture(
         begin_ns = begin_ns if number else frame.stamp_ns
         if frame.stamp_ns not in wanted:
             continue
-        shrink = min(1.0, _WIDTH_PX / frame.image.shape[1])
+        # Largest width of each, px.
+        shrink = min(1.0, 960 / frame.image.shape[1])
         small = cv2.resize(frame.image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         boxes = {p.number: p.boxes[frame.stamp_ns] * shrink for p in persons if frame.stamp_ns in p.boxes}
         for number, (x0, y0, x1, y1) in boxes.items():

@@ -13,9 +13,6 @@ from drocap_ros.motion import FILE, Motion
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.report.statistics import SMOOTH_S
 
-#: Time (s) from the last image that shows a person, or to the next one, over which the pose is drawn.
-_UNSEEN_S = 0.5
-
 
 def people_files(folder: Path) -> dict[int, Path]:
     """Motion files in the folders ``person_N`` of a folder without a motion of its own, by number."""
@@ -57,7 +54,8 @@ def _in_view(motion: Motion) -> np.ndarray:
         return np.zeros(len(times), bool)
     after = np.searchsorted(seen, np.arange(len(times))).clip(0, len(seen) - 1)
     near = [np.abs(times - times[seen[at]]) for at in (after, np.maximum(after - 1, 0))]
-    return np.asarray(np.minimum(*near) <= _UNSEEN_S)
+    # Time (s) from the last image that shows a person, or to the next one, over which the pose is drawn.
+    return np.asarray(np.minimum(*near) <= 0.5)
 
 
 def _places(motion: Motion) -> np.ndarray:

@@ -31,7 +31,6 @@ _DISTANCE, _REACH, _GRID_REACH, _GRID_STEP, _FOOT, _HEAD = 6.0, 1.12, 1.4, 0.5, 
 _BESIDE, _ABOVE = 0.75, 0.2
 #: Widths of limbs, m.
 _WIDTHS = {"hip": 0.05, "knee": 0.075, "ankle": 0.055, "neck": 0.055, "shoulder": 0.05, "elbow": 0.05}
-_WIDTH = 0.04  # m: of the others
 _TRUNK = ("lshoulder", "rshoulder", "rhip", "lhip")
 #: Bits of a fraction of a px in OpenCV's coordinates.
 _SHIFT = 4
@@ -165,7 +164,8 @@ class BodyPicture:
             yield float(trunk[:, 2].mean()) - 0.05, partial(_trunk, places=trunk)
         for parent, joint in self._bones(at):
             near, name = float(at[[parent, joint], 2].mean()), names[joint]
-            width = _WIDTHS.get(name.lstrip("lr") if name[0] in "lr" else name, _WIDTH) * float(at[joint, 3])
+            # Limbs without a width of their own have 4 cm.
+            width = _WIDTHS.get(name.lstrip("lr") if name[0] in "lr" else name, 0.04) * float(at[joint, 3])
             colour = _shaded(_COLOURS[side_of(name, names)], near)
             yield near, partial(_limb, ends=at[[parent, joint], :2], colour=colour, width=width)
             if name == "head":

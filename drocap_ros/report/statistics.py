@@ -16,10 +16,6 @@ from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
 
 #: Directions of view and of the body, and places without a world, are averaged over this time, s.
 SMOOTH_S = 0.5
-#: A knee counts as bent from this angle, degrees, on; below it the direction of the bend is noise.
-_BENT_DEG = 25.0
-#: Spread of the camera's bearings (mean square about the mean of unit vectors) of half a turn: 0.6; of a whole one: 1.
-_BEARINGS = 0.5
 #: Height of the neck above the ankles over their distance, from which a body is upright: one who lies leans anyhow.
 _UPRIGHT = 0.7
 _TORSO = ("pelvis", "neck", "lhip", "rhip", "lshoulder", "rshoulder")
@@ -202,7 +198,9 @@ def _lean(motion: Motion) -> float:
     lean, away = body[upright, :2] / length[upright, None], bearing[upright] / flat[upright, None]
     lean, away = lean - lean.mean(axis=0), away - away.mean(axis=0)
     spread = float(np.square(away).sum(axis=1).mean())
-    if spread < _BEARINGS:
+    # Spread of the camera's bearings (mean square about the mean of unit vectors) of half a turn: 0.6; of a whole one:
+    # 1.
+    if spread < 0.5:
         return float("nan")
     sine = float((lean * away).sum(axis=1).mean()) / spread
     return float(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
@@ -255,7 +253,8 @@ def _knees(joints: np.ndarray, motion: Motion, forward: np.ndarray) -> tuple[flo
         )
         thigh, shank = directions(knee - hip), directions(ankle - knee)
         # The knee lies off the line from hip to ankle, in the direction of thigh minus shank.
-        judged = np.degrees(np.arccos(np.clip(np.sum(thigh * shank, axis=1), -1.0, 1.0))) > _BENT_DEG
+        # A knee counts as bent from this angle, degrees, on; below it the direction of the bend is noise.
+        judged = np.degrees(np.arccos(np.clip(np.sum(thigh * shank, axis=1), -1.0, 1.0))) > 25.0
         bent += int(judged.sum())
         ahead += int((np.sum((thigh - shank) * forward, axis=1)[judged] > 0).sum())
     return (ahead / bent if bent else float("nan")), bent

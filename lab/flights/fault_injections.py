@@ -14,7 +14,7 @@ from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.orbit.states import Action, Command, OperatorCommand, State
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
-from drocap_ros.simulation.vehicle.copter_reports import CopterSetup, Readiness
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport, is_setpoint
 from lab.flights.fault_flight import FAULT_S, Injection
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
@@ -347,4 +347,4 @@ def wrong_ground(lower_m: float) -> Callable[[LoopSettings], LoopSettings]:
 
 def ready_late(settings: LoopSettings) -> LoopSettings:
     """Satellite fix, estimator and origin come one after the other; the last one too late for the start."""
-    return dataclasses.replace(settings, readiness=Readiness(2.0, 5.0, 9.0))
+    return dataclasses.replace(settings, ready_s=(2.0, 5.0, 9.0))

@@ -25,13 +25,13 @@ from drocap_ros.flight.orbit.states import Action, Command, CommandAnswer, Opera
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.simulation.keypoint_errors import detect_person
-from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
-from drocap_ros.simulation.vehicle.copter_reports import CopterSetup, Readiness
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 from drocap_ros.simulation.vehicle.mount import SimulatedMount
+from lab.simulation.keypoint_errors import detect_person
 
 EPOCH_NS = 1_700_000_000_000_000_000
 _STEP_S = 0.01
@@ -53,7 +53,7 @@ class LoopSettings:
         that come meanwhile are dropped
     stamp_late_s : of the pictures' stamps after the exposure, as a USB camera's
     gaps_hz : pauses of the telemetry, as on a busy machine; see :class:`Channel`
-    readiness : of the vehicle; the default is ready
+    ready_s : of the vehicle, as of ``CopterSetup``; the default is ready
     seconds : longest flight
     start_mode : "" = the mode in which the pilot hands over: GUIDED, or LOITER for PX4
     mount : of the camera: "gimbal", "servo" or "fixed"; the bridge is configured for it where the autopilot cannot
@@ -79,7 +79,7 @@ class LoopSettings:
     late_s: float = 0.3
     stamp_late_s: float = 0.0
     gaps_hz: float = 0.0
-    readiness: Readiness = field(default_factory=Readiness)
+    ready_s: tuple[float, float, float] = (-1.0, -1.0, -1.0)
     seconds: float = 40.0
     start_mode: str = ""
     mount: str = "gimbal"
@@ -168,7 +168,7 @@ class OrbitLoop:
                 timeout_s=settings.timeout_s,
                 mode=settings.start_mode or autopilot_of(settings.autopilot).handed_over_mode,
                 mount=SimulatedMount(settings.mount, settings.camera_pitch_deg),
-                readiness=settings.readiness,
+                ready_s=settings.ready_s,
             ),
         )
         self.rows: list[Row] = []

@@ -6,7 +6,7 @@ import numpy as np
 
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.simulation.orbit_camera import project
+from drocap_ros.simulation.pinhole import project
 from drocap_ros.simulation.render.renderer import Renderer
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 

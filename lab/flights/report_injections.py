@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.simulation.orbit_camera import pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from lab.flights.fault_flight import FAULT_S, Injection
 from lab.flights.orbit_loop import OrbitLoop
 
@@ -42,7 +42,7 @@ def unknown_mount(loop: OrbitLoop) -> None:
 
     def unknown(*arguments: Any) -> Any:
         reported = report(*arguments)
-        return None if reported is None else reported._replace(quaternion_wxyz=np.full(4, np.nan))
+        return None if reported is None else (np.full(4, np.nan), reported[1])
 
     mount.report = unknown  # type: ignore[method-assign, assignment]
 

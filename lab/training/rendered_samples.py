@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.perception.models.network_input import crop_around, cut, letterbox
-from drocap_ros.simulation.orbit_camera import look_at, project
+from drocap_ros.simulation.pinhole import project
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw
 from drocap_ros.simulation.render.scenery import Scenery, draw_background, make_scenery
 from drocap_ros.simulation.simulated_person import ACTIONS, simulate_person
+from lab.simulation.orbit import look_at
 
 #: Input sizes of the networks (width, height) px, and the pose crop's side over that of the box.
 DETECTOR_SIZE = (320, 192)

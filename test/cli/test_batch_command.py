@@ -21,8 +21,8 @@ from drocap_ros.cli.batch import read_inputs
 from drocap_ros.cli.batch_recording import Task, content_digest, fingerprint, run_on_this_machine, stat_digest
 from drocap_ros.motion import load_motion
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.tracks import load_tracks, save_tracks
+from lab.simulation.capture import simulate_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 GOOD = 4

@@ -10,8 +10,8 @@ import pytest
 
 from drocap_ros.cli import COMMANDS, main
 from drocap_ros.cli.options import ros_namespace
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.tracks import save_tracks
+from lab.simulation.capture import simulate_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "scipy", "cv2", "rclpy", "onnxruntime", "matplotlib", "torch")

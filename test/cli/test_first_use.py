@@ -11,9 +11,9 @@ from telemetry_logs import dji_subtitle, srt_text
 from drocap_ros.cli import main
 from drocap_ros.motion import load_motion, save_motion
 from drocap_ros.recording.mcap.writer import SessionWriter
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15, COCO_17, LIMB_JOINTS
 from drocap_ros.tracks import Tracks, load_tracks, save_tracks
+from lab.simulation.capture import simulate_capture
 
 cv2 = pytest.importorskip("cv2")
 

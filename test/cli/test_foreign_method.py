@@ -11,9 +11,9 @@ import pytest
 from walking import make_walk
 
 from drocap_ros.motion import load_motion
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import save_tracks
+from lab.simulation.capture import simulate_capture
 
 #: Methods that cannot run, and what is said of them.
 REFUSED = {

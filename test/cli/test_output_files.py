@@ -14,8 +14,8 @@ from refusals import refused
 from drocap_ros.cli import main
 from drocap_ros.cli.atomic_output import default_folder, output_folder
 from drocap_ros.motion import load_motion, save_motion
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.tracks import save_tracks
+from lab.simulation.capture import simulate_capture
 
 OWN_INPUT = "found the command's own input"
 

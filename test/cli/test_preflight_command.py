@@ -100,7 +100,7 @@ def fly(folder, names):
         if autopilot:
             more = words if words and words[0].startswith("--") else ()
             settings = (*SETTINGS[autopilot], *(words if not more else ()))
-            module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
+            module = "lab.simulation.path_vehicle"
             place = ("--url", f"udpout:127.0.0.1:{port}", "--autopilot", autopilot)
             vehicles.append(start(module, *place, *more, "--set", *settings, log=folder / f"{name}.vehicle"))
         options = ("--config", config, "--seconds", "5", "--json", folder / f"{name}.json")
@@ -226,7 +226,7 @@ def test_ctrl_c_ends_it_at_once_and_leaves_no_file(tmp_path):
 def test_with_a_running_graph_it_reads_what_the_bridge_hears(tmp_path):
     port = free_udp_port()
     config = write_config(tmp_path / "c.yaml", f"udpin:127.0.0.1:{port}", "simulation")
-    module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
+    module = "lab.simulation.path_vehicle"
     vehicle = start(module, "--url", f"udpout:127.0.0.1:{port}", "--set", "GUID_TIMEOUT=3.0", log=tmp_path / "vehicle")
     live = start("drocap_ros.cli", "live", "--config", config, "--nodes", "mavlink_bridge", log=tmp_path / "live")
     try:

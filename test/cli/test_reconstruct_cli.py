@@ -13,9 +13,9 @@ from drocap_ros.cli import main
 from drocap_ros.evaluation.metrics import aligned_error
 from drocap_ros.motion import load_motion
 from drocap_ros.perception.sources.video import VideoSource
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import LIMB_JOINTS, indices
 from drocap_ros.tracks import save_tracks
+from lab.simulation.capture import simulate_capture
 
 #: BlazePose-33's places of the 12 limb joints, in the order of LIMB_JOINTS.
 BLAZEPOSE = [24, 26, 28, 23, 25, 27, 11, 13, 15, 12, 14, 16]

@@ -13,8 +13,8 @@ from refusals import refused
 from drocap_ros.cli import main
 from drocap_ros.motion import load_motion, save_motion
 from drocap_ros.report.motion_images import FollowingBox
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.tracks import save_tracks
+from lab.simulation.capture import simulate_capture
 
 
 @pytest.fixture

@@ -11,10 +11,11 @@ import pytest
 from drocap_ros.cli import main
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.motion import load_motion
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks, save_tracks
+from lab.simulation.orbit import orbit_camera
 from lab.studies.world_scene import PinholePath, followed_points
 
 SIZE, FPS, FRAMES = (1280, 720), 30.0, 240

@@ -17,7 +17,7 @@ from drocap_ros.cli import main
 from drocap_ros.export import export
 from drocap_ros.export.usd import lens_of
 from drocap_ros.motion import save_motion
-from drocap_ros.simulation.capture import simulate_capture
+from lab.simulation.capture import simulate_capture
 
 ROOT = Path(__file__).parents[2]
 _BACK = """

@@ -8,7 +8,7 @@ from pathlib import Path
 from recorded import NAMES, Messages, record
 
 from drocap_ros.config import DrocapConfig
-from drocap_ros.simulation.capture import simulate_capture
+from lab.simulation.capture import simulate_capture
 
 FLIGHT = ("session_player", "initializer", "bundle_adjuster", "session_recorder")
 

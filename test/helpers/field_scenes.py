@@ -15,11 +15,12 @@ import numpy as np
 
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.nms import iou
-from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw_people
 from drocap_ros.simulation.render.scenery import make_scenery
 from drocap_ros.simulation.simulated_person import simulate_person
+from lab.simulation.orbit import look_at
 
 SIZE = (1280, 720)
 #: On the subject: least number of keypoints, their least share inside the true box, the margin of that, and the least

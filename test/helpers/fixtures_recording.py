@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from recorded import START_NS, Messages, write_poses
 
-from drocap_ros.simulation.capture import simulate_capture
+from lab.simulation.capture import simulate_capture
 
 
 @pytest.fixture(scope="session")

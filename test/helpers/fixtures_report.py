@@ -9,8 +9,8 @@ import pytest
 from report_motions import first_frames
 
 from drocap_ros.motion import Motion
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
+from lab.simulation.capture import simulate_capture
 
 
 @pytest.fixture(scope="session")

@@ -6,13 +6,13 @@ import math
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.observed import Course, Health, Height, Link, Mode, Motion, Observed, Pictures, Subject
 from drocap_ros.flight.orbit.safety import reduce
-from drocap_ros.flight.orbit.states import Action, Command, Idle, Limits, State
+from drocap_ros.flight.orbit.states import Action, Command, Idle, State
 
-LIMITS = Limits(SafetyConfig(commands_enabled=True, mode_change_allowed=True), OrbitConfig())
+LIMITS = MavlinkBridgeConfig(commands_enabled=True, mode_change_allowed=True, max_control_timeout_s=0.0)
 #: Parts of an observation and fields of theirs by short names, with which :func:`changed` sets them.
 FIELDS = {
     "mode": ("mode", "name"),

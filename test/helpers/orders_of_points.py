@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 
 from drocap_ros.recording.keypoints.orders import ORDERS
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project, to_camera
+from drocap_ros.simulation.pinhole import pinhole_matrix, project, to_camera
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
+from lab.simulation.orbit import orbit_camera
 
 SIZE = (1280, 720)
 J = BODY_17.index

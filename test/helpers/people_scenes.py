@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 
 from drocap_ros.perception.sources.base import Frame
-from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw_people
 from drocap_ros.simulation.render.scenery import make_scenery
 from drocap_ros.simulation.simulated_person import simulate_person, two_bone
 from drocap_ros.skeleton import BODY_15
+from lab.simulation.orbit import look_at
 
 SIZE = (1280, 720)
 _GAIT_M_S = 1.2  # mean speed of the simulated walk

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw
 from drocap_ros.simulation.render.scenery import make_scenery
 from drocap_ros.simulation.simulated_person import simulate_person
+from lab.simulation.orbit import orbit_camera
 
 
 def rendered_images(count: int, rate_hz: float = 30.0, seed: int = 0) -> list[np.ndarray]:

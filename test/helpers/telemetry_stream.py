@@ -11,8 +11,8 @@ from drocap_ros.background import Background
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.skeleton import BODY_17
+from lab.simulation.capture import SimulationConfig, simulate_capture
 from lab.studies.world_scene import PinholePath, followed_points
 
 FPS = 15.0

@@ -28,7 +28,7 @@ from drocap_ros.ros.conversions import (
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import NODES as GRAPH
 from drocap_ros.ros.topics import TOPICS
-from drocap_ros.simulation.capture import simulate_capture
+from lab.simulation.capture import simulate_capture
 
 NODES = ("initializer", "bundle_adjuster", "session_recorder")
 S = 10**9

@@ -15,7 +15,7 @@ from drocap_ros.nodes.mavlink_bridge import MavlinkBridgeNode
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.ros.conversions import camera_info_to_ros, header_at, pose2d_to_ros
 from drocap_ros.ros.topics import KEPT_QOS
-from drocap_ros.simulation.orbit_camera import pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from drocap_ros.simulation.vehicle.loopback import free_udp_port
 
 

@@ -11,8 +11,8 @@ from drocap_ros.contacts import ANKLES
 from drocap_ros.reconstruction import reconstruct as reconstruction
 from drocap_ros.reconstruction.balance import balanced
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput
-from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.skeleton import BODY_17
+from lab.simulation.capture import SimulationConfig, simulate_capture
 from lab.studies.world_scene import PinholePath, followed_points
 
 NECK = BODY_17.index("neck")

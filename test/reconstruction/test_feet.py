@@ -14,10 +14,11 @@ from drocap_ros.motion import load_motion, save_motion
 from drocap_ros.reconstruction.body_input import body_keypoints
 from drocap_ros.report.checks import MotionCheck, run_checks
 from drocap_ros.report.statistics import motion_statistics
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, HALPE_26
 from drocap_ros.tracks import Tracks, load_tracks, save_tracks
+from lab.simulation.orbit import orbit_camera
 
 FRAMES, FPS = 96, 24.0
 TIMES = np.arange(FRAMES) / FPS

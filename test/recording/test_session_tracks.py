@@ -14,8 +14,8 @@ from drocap_ros.recording.pose_messages import add_calibration, read_observation
 from drocap_ros.recording.session import BACKGROUND_TRACKS as POINTS
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 from drocap_ros.recording.session_tracks import read_pose2d
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.vehicle.mavlink_vehicle import SampledPath
+from lab.simulation.capture import simulate_capture
+from lab.simulation.path_vehicle import SampledPath
 
 POSE2D, STATE, INFO = NAMES["pose2d"], NAMES["state"], NAMES["info"]
 

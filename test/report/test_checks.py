@@ -8,10 +8,10 @@ import pytest
 from drocap_ros.motion import upright_joints
 from drocap_ros.report.checks import MotionCheck, Severity, run_checks
 from drocap_ros.report.statistics import motion_statistics, smooth
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.orbit_camera import look_at
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
+from lab.simulation.capture import simulate_capture
+from lab.simulation.orbit import look_at
 
 
 def results(motion):

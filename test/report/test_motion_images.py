@@ -14,9 +14,10 @@ from drocap_ros.report import motion_images
 from drocap_ros.report.motion_images import ImagesBeside, has_images, read_motion_images
 from drocap_ros.report.page import page_data
 from drocap_ros.report.statistics import motion_statistics
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.render.renderer import Renderer
 from drocap_ros.simulation.simulated_person import simulate_person
+from lab.simulation.orbit import orbit_camera
 
 cv2 = pytest.importorskip("cv2")
 

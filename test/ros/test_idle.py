@@ -9,8 +9,8 @@ from drocap_ros.keypoints import PoseObservation
 from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.diagnostics import node_of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.vehicle.loopback import free_udp_port
+from lab.simulation.capture import simulate_capture
 
 NODES = ["pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer", "session_recorder"]
 SILENT = {

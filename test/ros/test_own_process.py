@@ -14,9 +14,10 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.ros.own_process import LoadShedding, LookAhead, OwnProcess
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from drocap_ros.simulation.render.renderer import Renderer
 from drocap_ros.simulation.simulated_person import simulate_person
+from lab.simulation.orbit import orbit_camera
 
 STEP_NS = 66_666_667  # of a camera with 15 images a second
 

@@ -23,9 +23,9 @@ from drocap_ros.ros import markers
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import KEPT_QOS, RESULT_QOS, TFMessage
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.view.visualizer_config import VisualizerConfig
+from lab.simulation.capture import simulate_capture
 
 hri = pytest.importorskip("hri_msgs.msg", reason="no hri_msgs here: `make setup` builds it")
 

@@ -23,12 +23,12 @@ from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import OrbitStatus
 from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.topics import TOPICS
-from drocap_ros.simulation.keypoint_errors import noisy_keypoints
-from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.loopback import free_udp_port
+from lab.simulation.keypoint_errors import noisy_keypoints
 
 ROOT = Path(__file__).resolve().parents[2]
 OTHER_POSE_PUBLISHER, SECOND_BRIDGE = 130, 131  # CONDITION_* of OrbitStatus

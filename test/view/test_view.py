@@ -21,9 +21,9 @@ from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.live_replay import replay
 from drocap_ros.motion import Motion, load_motion, save_motion, upright_joints
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.view.motion_view import Scene, draw_motion, new_recording, nominal_camera_matrix, place_cameras
+from lab.simulation.capture import simulate_capture
 
 pytest.importorskip("rerun", reason="no Rerun viewer here: `make setup` brings it")
 

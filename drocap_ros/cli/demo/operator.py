@@ -11,12 +11,8 @@ from drocap_ros.flight.orbit.states import Command, State
 
 #: Longest wait for the bridge to be ready: the pilot's take-off and hand-over take 6 s.
 READY_TIMEOUT_S = 60.0
-#: Longest wait for the orbit after a command: the autopilot may take seconds to change its mode.
-ORBIT_TIMEOUT_S = 10.0
 #: Pause between tries.
 RETRY_S = 2.0
-#: The bridge must be ready for this long before the start.
-STEADY_S = 1.0
 #: Time for the vehicle to come to rest after the stop.
 REST_S = 3.0
 
@@ -128,7 +124,8 @@ class Operator:
         again = bool(self.holds)
         self._remark("starting the orbit again" if again else "ready: starting the orbit")
         self.phase = Phase.REQUESTED
-        self._next_try_s = now_s + ORBIT_TIMEOUT_S
+        # Longest wait for the orbit after a command: the autopilot may take seconds to change its mode.
+        self._next_try_s = now_s + 10.0
         return Command.ENGAGE if again or self.requests_control else Command.START
 
     def _is_steady(self, seen: _Status) -> bool:
@@ -137,7 +134,8 @@ class Operator:
             self._ready_s = math.nan
         elif math.isnan(self._ready_s):
             self._ready_s = seen.now_s
-        return seen.state == State.HOLDING or seen.now_s - self._ready_s >= STEADY_S
+        # The bridge must be ready for this long before the start.
+        return seen.state == State.HOLDING or seen.now_s - self._ready_s >= 1.0
 
     def _expect_orbit(self, seen: _Status) -> None:
         if seen.state == State.ORBITING:

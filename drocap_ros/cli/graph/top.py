@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 #: How long ``--once`` waits for a first status, and then at most for further nodes: discovery may take seconds.
 ONCE_TIMEOUT_S = 8.0
-#: All nodes have been heard when for so long none was new; each publishes its status once a second.
-_QUIET_S = 1.5
 #: Words and colours of the levels of diagnostic_msgs/DiagnosticStatus.
 _LEVELS = {0: ("ok", "green"), 1: ("warning", "yellow"), 2: ("error", "red"), 3: ("stale", "magenta")}
 _LATENCY = (Key.LATENCY_P50, Key.LATENCY_P95, Key.LATENCY_P99)
@@ -132,7 +130,8 @@ def _print_once(graph: Graph, dashboard: Dashboard, stopped: Callable[[], bool])
 
     def all_heard() -> bool:
         before, known[:] = known.copy(), dashboard.heard(namespace)
-        return stopped() or known == before or graph.wait(stopped, _QUIET_S)
+        # All nodes have been heard when for so long none was new; each publishes its status once a second.
+        return stopped() or known == before or graph.wait(stopped, 1.5)
 
     graph.wait(all_heard, ONCE_TIMEOUT_S)
     if not known:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, Setpoint, coast_of
+from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, Setpoint
 
 
 class Gains(NamedTuple):
@@ -366,8 +366,13 @@ class Autopilot:
         return (*self.loss_names, *fence, *mount, *(check.name for check in self.checks))
 
     def coast_of(self, setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, timeout_s: float) -> Coast:
-        """Horizontal motion until the vehicle stands, if this setpoint is the last one; see :func:`coast_of`."""
-        return coast_of(setpoint, position, velocity, self.coasting, timeout_s)
+        """Horizontal motion until the vehicle stands, if this setpoint is the last one.
+
+        position, velocity : (3,) m, m/s of the vehicle, in the frame of the setpoint
+        """
+        here, flown = complex(*position[:2]), complex(*velocity[:2])
+        goal, wanted, push = (complex(*vector[:2]) for vector in setpoint[:3])
+        return self.coasting.after(here, flown, goal, wanted, push, timeout_s)
 
 
 #: An autopilot without an instance of its own.

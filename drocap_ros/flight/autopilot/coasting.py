@@ -62,30 +62,16 @@ class Coast(NamedTuple):
         return self.creep_m * max(float((way * sight.conjugate()).real) / length, 0.0) if length > 1e-6 else 0.0
 
 
-class Last(NamedTuple):
-    """Horizontal state of the vehicle and of its last setpoint: m, m/s, m/s^2."""
-
-    place: complex
-    velocity: complex
-    goal: complex
-    wanted: complex
-    push: complex
-
-
 class Coasting(Protocol):
     """How an autopilot flies on without setpoints."""
 
-    def after(self, last: Last, timeout_s: float) -> Coast:
-        """Motion until the vehicle stands; the autopilot ends the setpoint's motion after ``timeout_s``."""
+    def after(
+        self, place: complex, velocity: complex, goal: complex, wanted: complex, push: complex, timeout_s: float
+    ) -> Coast:
+        """Horizontal motion until the vehicle stands; the autopilot ends the setpoint's motion after ``timeout_s``.
 
-
-def coast_of(setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, how: Coasting, timeout_s: float) -> Coast:
-    """Horizontal motion from here until the vehicle stands, if this setpoint is the last one.
-
-    position, velocity : (3,) m, m/s of the vehicle, in the frame of the setpoint
-    """
-    vectors = (position, velocity, setpoint.position, setpoint.velocity, setpoint.acceleration)
-    return how.after(Last(*(complex(*vector[:2]) for vector in vectors)), timeout_s)
+        place, velocity : of the vehicle, m, m/s; goal, wanted, push : of the setpoint, m, m/s, m/s^2
+        """
 
 
 @dataclass(frozen=True)
@@ -102,9 +88,10 @@ class ContinuedCoasting:
     excess: float
     standing_m_s: float
 
-    def after(self, last: Last, timeout_s: float) -> Coast:
+    def after(
+        self, place: complex, velocity: complex, goal: complex, wanted: complex, push: complex, timeout_s: float
+    ) -> Coast:
         """See :class:`Coasting`."""
-        place, velocity, goal, wanted, push = last
         most, jerk = self.acceleration_m_s2, self.jerk_m_s3
         # Of the setpoint's acceleration only what does not slow down counts from the first moment: it may be a new one.
         along = _direction(velocity)
@@ -148,9 +135,10 @@ class HeldCoasting:
     creep_m: float
     standing_m_s: float
 
-    def after(self, last: Last, timeout_s: float) -> Coast:
+    def after(
+        self, place: complex, velocity: complex, goal: complex, wanted: complex, push: complex, timeout_s: float
+    ) -> Coast:
         """See :class:`Coasting`."""
-        place, velocity, goal, wanted, push = last
         wanted += self.push_s * push
         rows = [(0.0, place, abs(velocity))]
         dt, t = _STEP_S, 0.0

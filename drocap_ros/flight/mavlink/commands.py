@@ -83,7 +83,6 @@ def _encode(mav: mavlink.MAVLink, target: tuple[int, int], mask: int, setpoint: 
 
 _RETRY_S = 0.4  # between tries: two round trips at the longest that is flown with
 _TRIES = 5  # 2 s of them: an autopilot that does not answer then has not heard
-_PROGRESS_S = 3.0  # more patience with an autopilot that answers IN_PROGRESS
 _REPEAT_S = 1.5  # after an answer: the mode it granted has been reported by then, and a second answer has come
 _NOT_ANSWERED = -1  # beside the MAV_RESULTs
 _RESULTS = {
@@ -156,7 +155,8 @@ class CommandQueue:
                 return
             pending.result = None
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
-            pending.sent_s = now_s + _PROGRESS_S - _RETRY_S
+            # Such an answer earns more patience.
+            pending.sent_s = now_s + 3.0 - _RETRY_S
         elif result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED and pending.tries < _TRIES:
             pending.sent_s, pending.refusal = now_s, result  # retried after the usual time
         else:

@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 #: vehicle stands by then: it brakes at 1.3 m/s^2 and more, from 2.3 m/s at most (``max_coast_m``).
 PACKETS, PERIOD_S = 8, 0.2
 _CHECK_S = 0.02  # as the watchdog's
-_OUTDATED_S = 0.5  # since the vehicle was sent anything: the autopilot's time-out has ended the motion
 _MOST_READ, _MAX_DATAGRAM = 100, 65535  # of what has arrived in a step, and bytes each: a flood delays no packet
-_LONGEST_ORDER = 16384  # bytes: eight signed packets of 73 in digits are 1.3 kB
 _ENDS_S = PACKETS * PERIOD_S + 0.5  # until it has ended, one that holds too
 #: What ends a group of processes, as a service manager does with those that a dead bridge leaves: it ends by itself.
 _IGNORED = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -66,7 +64,8 @@ class Guardian:
 
     def due(self, now_s: float) -> bytes | None:
         """The packet to send now."""
-        if now_s - max(self._heard_s, self._sent_s) > _OUTDATED_S:
+        # The autopilot's time-out has ended the motion by then.
+        if now_s - max(self._heard_s, self._sent_s) > 0.5:
             self._packets = []  # of another place than the present one
         silent = self.ended or now_s - self._heard_s > self._limit_s
         if not (silent and self._packets and now_s - self._sent_s >= PERIOD_S):
@@ -193,7 +192,8 @@ def main(channel: socket.socket, limit_s: float) -> None:
             if any(has_left(part, control) for part in port.read()):
                 guardian.take(_now_s(), [])
         elif select.select([channel], [], [], _CHECK_S if guardian.armed else None)[0]:
-            data, descriptors, *_ = socket.recv_fds(channel, _LONGEST_ORDER, 1)
+            # Eight signed packets of 73 bytes in digits are 1.3 kB.
+            data, descriptors, *_ = socket.recv_fds(channel, 16384, 1)
             guardian.ended = not data
             if data:
                 order = json.loads(data)

@@ -29,9 +29,6 @@ from drocap_ros.flight.vehicle import VehicleState
 from drocap_ros.stamps import NS
 
 _RECONNECT_S = 1.0  # between tries to open a broken link again
-_SENT_SETPOINTS = 80  # kept: 1.6 s at the greatest control_hz, longer than any echo is awaited
-_REQUEST_PERIOD_S = 0.02  # between requests: an answer names none, so one is pending at a time
-_PENDING_SYNCS = 64  # questions without an answer, after which the link counts as one-way
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +71,8 @@ class MavlinkLink:
         self._due: dict[str, float] = {}
         self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
         self._answered_s = math.nan  # when the message was sent that was answered last, monotonic
-        self._sent: deque[tuple[float, Message]] = deque(maxlen=_SENT_SETPOINTS)  # monotonic s
+        # 1.6 s of them at the greatest control_hz: no echo is awaited for longer.
+        self._sent: deque[tuple[float, Message]] = deque(maxlen=80)  # monotonic s
         #: Monotonic time of the control step that decides what is sent: what is older than ``watchdog_s`` is dropped.
         self.decided_s = math.inf
         self._broken_s: float | None = None
@@ -295,12 +293,14 @@ class MavlinkLink:
             return
         now_ns = self._clock_ns()
         if self._is_due("time_sync", 1.0 / self.config.time_sync_hz):
-            if len(self._sync_sent) > _PENDING_SYNCS:
+            # After so many questions without an answer the link counts as one-way.
+            if len(self._sync_sent) > 64:
                 self._sync_sent.clear()
             self._sync_sent[now_ns] = self._monotonic_s()
             self._send(self.mav.timesync_encode(0, now_ns))
         system, component = self.estimator.system_id, self.estimator.component_id
-        if self._is_due("request", _REQUEST_PERIOD_S):
+        # An answer names no request, so one is pending at a time.
+        if self._is_due("request", 0.02):
             for number, interval_us in self._requests.due(now_ns):
                 self._send(
                     self.mav.command_long_encode(

@@ -11,9 +11,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import InputError
 from drocap_ros.flight.mavlink.commands import Message
 
-_EPOCH_NS = 1_420_070_400_000_000_000  # 2015-01-01, from which signing counts in units of 10 us
-_LONGEST_FILE = 1024  # bytes of a key's file that are read: it has 64 digits
-
 
 class CurrentMode(mavlink.MAVLink_message):
     """CURRENT_MODE (message 436), which pymavlink 2.4.50 does not have, as its generator would write it.
@@ -57,7 +54,8 @@ def read_signing_key(path: str) -> bytes:
     remedy = "write one by `openssl rand -hex 32`, and give the autopilot the same"
     try:
         with file.open("rb") as opened:
-            text = opened.read(_LONGEST_FILE + 1)
+            # A key's file has 64 digits.
+            text = opened.read(1025)
     except OSError as error:
         raise InputError(
             f"signing_key_file: expected a file that can be read, got {path!r}: {error.strerror}; {remedy}"
@@ -73,7 +71,8 @@ def read_signing_key(path: str) -> bytes:
 
 def signing_time(now_ns: int) -> int:
     """Time of a signature: 10 us since 2015; 0 from a clock that was never set."""
-    return max((now_ns - _EPOCH_NS) // 10_000, 0)
+    # Signing counts from 2015-01-01, in units of 10 us.
+    return max((now_ns - 1_420_070_400_000_000_000) // 10_000, 0)
 
 
 def sign_with(mav: mavlink.MAVLink, key: bytes, now_ns: int, link_id: int = 0) -> None:

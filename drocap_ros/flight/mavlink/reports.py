@@ -19,8 +19,6 @@ from drocap_ros.stamps import NS
 _EARTH, _NOSE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 _STALE_S = {"gimbal": 3.0, "servo": 0.5}  # without angles; those of servos follow the body's lean
 _STEP_S = 0.25  # between two reports, beyond which a rotation is not extrapolated
-#: A servo follows its demanded angle this much later: a frame of its signal, and its turning.
-_SERVO_DELAY_S = 0.05
 
 
 class Mount:
@@ -93,7 +91,8 @@ class Mount:
         if before is not None and before.from_north == latest.from_north:
             step_ns = latest.received_ns - before.received_ns
             if 0 < step_ns <= _STEP_S * NS:
-                delay_s = _SERVO_DELAY_S if self.kind == "servo" else 0.0
+                # A servo follows its demanded angle this much later: a frame of its signal, and its turning.
+                delay_s = 0.05 if self.kind == "servo" else 0.0
                 after_ns = received_ns - int(delay_s * NS) - latest.received_ns
                 part = min(max(after_ns / step_ns, -1.0), 1.0)
                 angles = slerp(before.quaternion, angles, 1.0 + part)
@@ -154,7 +153,6 @@ def finite_quaternion(x: float, y: float, z: float, w: float) -> np.ndarray | No
 
 #: Packets; farther back a sequence number counts as the beginning of a new sequence.
 _MAX_LATE = 32
-_HISTORY_S = 1.0  # in which packets of a former mode may still arrive late
 #: Share of lost packets above which no mode is requested: the pilot may have chosen one unseen.  At a quarter, the
 #: chance that both reports of a mode within 0.2 s are lost is 6 %.
 MAX_LOSS = 0.25
@@ -245,7 +243,8 @@ class ModeReports:
             # What was sent before the present mode began, with the mode of that time, is no news.  Any other mode is
             # one in between: the vehicle was in it.
             first, since_ns = self._changed
-            history = 0 < (first - sequence) % 256 <= _MAX_LATE and now_ns - since_ns < _HISTORY_S * NS
+            # Packets of a former mode may still arrive late for a second.
+            history = 0 < (first - sequence) % 256 <= _MAX_LATE and now_ns - since_ns < NS
             if not (history and mode == self._before):
                 self._heard.append(mode)
             return

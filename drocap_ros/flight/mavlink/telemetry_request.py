@@ -88,10 +88,7 @@ class AutopilotSettings:
         return {name: setting.value for name, setting in self._settings.items()}
 
 
-_FAST_HEARTBEAT_HZ = 5.0  # where it may be requested: a pilot's mode is seen within 0.2 s
 CURRENT_MODE_HZ = 2.0  # while nothing changes: measured
-_CURRENT_MODE_INTERVAL_HZ = 20.0  # asked for: a change comes after one interval
-_ECHO_HZ = 10.0  # two echoes within the time after which a mismatch counts
 _GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
 #: Requests for the attitude of a mount that has never sent it, after which there is none.
 _MOUNT_REQUESTS = 10  # without an answer: 20 s at the usual retries
@@ -169,8 +166,10 @@ class TelemetryRequests:
         }
         if config.commands_enabled:
             # At their usual 1 Hz a pilot's change of mode and the echo of our setpoints would be noticed a second late.
-            rates[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = _FAST_HEARTBEAT_HZ
-            rates[mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED] = _ECHO_HZ
+            # A pilot's mode is seen within 0.2 s.
+            rates[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = 5.0
+            # Two echoes arrive within the time after which a mismatch counts.
+            rates[mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED] = 10.0
         self._wanted = {number: _Wanted(rate) for number, rate in rates.items() if rate > 0}
         self._since_ns: int | None = None
 
@@ -181,7 +180,8 @@ class TelemetryRequests:
             self._wanted.setdefault(number, _Wanted(self._config.status_hz))
         fixed = not autopilot.heartbeat_on_request
         if fixed and self._wanted.pop(mavlink.MAVLINK_MSG_ID_HEARTBEAT, None) is not None:
-            self._wanted[CurrentMode.id] = _Wanted(CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ)
+            # A change comes after one interval of those that are asked for.
+            self._wanted[CurrentMode.id] = _Wanted(CURRENT_MODE_HZ, 20.0)
 
     def count(self, message_id: int, now_ns: int) -> None:
         """Count a message."""

@@ -19,11 +19,9 @@ if TYPE_CHECKING:
 URL_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE[:BAUD]"
 Address: TypeAlias = tuple[str | int | bytes, ...]  # of a datagram, as its family has it
 _MAX_DATAGRAM = 65535  # bytes of UDP
-_CONNECT_TIMEOUT_S = 3.0  # of TCP, on a local network
 _TAKEN = (errno.EADDRINUSE, errno.EAGAIN, errno.EBUSY)  # of UDP, of the lock of a serial port, of its exclusive use
 #: The guardian of a bridge that died holds its port for 1.6 s at most; tried again so often.
 _HELD_S, _AGAIN_S = 2.0, 0.1
-_DEFAULT_BAUD = 57600  # of telemetry radios as shipped
 
 
 class LinkError(DrocapError):
@@ -100,7 +98,8 @@ def _address(text: str, url: str) -> tuple[str, int]:
 def _open_serial(rest: str, url: str) -> Transport:
     device, _, baud = rest.rpartition(":")
     if not device:
-        device, baud = rest, str(_DEFAULT_BAUD)
+        # Telemetry radios have this baud rate as shipped.
+        device, baud = rest, "57600"
     if not baud.isdigit() or int(baud) == 0:
         raise InputError(f"url: expected a baud rate after the last colon, got {url!r}; use serial:/dev/ttyACM0:57600")
     try:
@@ -169,7 +168,8 @@ class _UdpTransport(Transport):
 
 class _TcpTransport(Transport):
     def __init__(self, host: str, port: int) -> None:
-        self._socket = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT_S)
+        # A local network connects sooner.
+        self._socket = socket.create_connection((host, port), timeout=3.0)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setblocking(False)
 

@@ -36,7 +36,6 @@ from drocap_ros.flight.orbit.states import (
     Fault,
     Holding,
     Idle,
-    Limits,
     ModeRequest,
     OperatorCommand,
     Orbiting,
@@ -79,11 +78,6 @@ class ControlStatus(NamedTuple):
         return "; ".join(filter(None, (present, failed, self.way_out)))
 
 
-_STANDING_M_S = 0.05  # speed below which a setpoint stands
-_GIMBAL_PERIOD_S = 0.5  # between pitches of the mount: radius and height change slowly
-_MODE_AGE_STEPS = 1.5  # a report of the mode is seen in the step that follows it
-
-
 class OrbitController:
     """Flies the orbit through a link.  States, images and commands may come from other threads than the steps.
 
@@ -93,14 +87,8 @@ class OrbitController:
 
     def __init__(self, link: MavlinkLink, config: MavlinkBridgeConfig, watchdog: Watchdog | None = None) -> None:
         self._link, self._config, self._watchdog = link, config, watchdog
-        self._limits = Limits(
-            config,
-            config,
-            max_control_timeout_s=config.max_control_timeout_s,
-            max_mode_age_s=_MODE_AGE_STEPS / config.control_hz,
-        )
         self._observer, self._desk = Observer(config), CommandDesk(config)
-        self._orbit = FlownOrbit(config, self._limits)
+        self._orbit = FlownOrbit(config)
         self._queue = CommandQueue()
         self._lock = threading.Lock()
         self.safety: SafetyState = Idle()
@@ -174,8 +162,7 @@ class OrbitController:
         self._desk.hear_operator(now_ns, now_s)
         order = self._desk.next(now_ns, self.safety, self._orbit.goal, self._observer.framing)
         before = self.safety
-        limits = self._limits._replace(warm_up_s=seen.autopilot.warm_up_s)
-        self.safety, decision = reduce(before, seen, now_s, order.kind if order else None, limits)
+        self.safety, decision = reduce(before, seen, now_s, order.kind if order else None, self._config)
         if order is not None and decision.answer is not None:
             self._desk.answer(order.command, decision.answer)
             if decision.answer.accepted:
@@ -219,7 +206,8 @@ class OrbitController:
         if isinstance(safety, Orbiting):
             setpoint = self._orbit.setpoint(seen, safety, self._observer.framing, dt)
             # A setpoint that stands stays at zero: nothing moves by an estimate alone.
-            if setpoint is not None and math.sqrt(setpoint.velocity @ setpoint.velocity) > _STANDING_M_S:
+            # Speed below which a setpoint stands.
+            if setpoint is not None and math.sqrt(setpoint.velocity @ setpoint.velocity) > 0.05:
                 # The autopilot's loop compares it with the velocity that it reports, error included.
                 setpoint = setpoint._replace(velocity=setpoint.velocity + seen.vehicle.velocity_offset)
         elif action == Action.HOLD and isinstance(safety, Requesting | Holding) and safety.position is not None:
@@ -238,7 +226,8 @@ class OrbitController:
         if self._queue.failure(GIMBAL_PITCH):
             self._gimbal_s, self._observer.framing.follows = math.inf, False  # there is no mount: no further requests
         subject, wanted = seen.subject.position, self._config.gimbal_control and self.safety.state == State.ORBITING
-        if wanted and subject is not None and now_s - self._gimbal_s > _GIMBAL_PERIOD_S:
+        # Radius and height change slowly: two pitches of the mount a second will do.
+        if wanted and subject is not None and now_s - self._gimbal_s > 0.5:
             drop = float(seen.vehicle.position[2] - subject[2])
             pitch = -math.degrees(math.atan2(drop, max(seen.subject.distance_m, 0.1)))
             nan = math.nan
@@ -260,7 +249,7 @@ class OrbitController:
             commands = FallbackCommands(
                 self._link.check_motion(hold),
                 self._link.check_motion(mode),
-                lambda: self._link.fresh_mode(self._limits.max_mode_age_s) == autopilot.control_mode,
+                lambda: self._link.fresh_mode(self._config.max_mode_age_s) == autopilot.control_mode,
                 lambda: self._link.estimator.modes.mode != autopilot.control_mode,
             )
         self._watchdog.kick(now_s, commands)
@@ -281,7 +270,7 @@ class OrbitController:
             condition=self._orbit.flown_condition(present, seen) if orbiting else present,
             failed=self.safety.failed if isinstance(self.safety, Idle) else None,
             mode_failure=self._queue.failure(SET_MODE),
-            way_out=way_out(self.safety, seen, self._limits),
+            way_out=way_out(self.safety, seen, self._config),
             answers=self._desk.take_answers(),
             radius_m=distance_m,
             height_m=vehicle.height.m,

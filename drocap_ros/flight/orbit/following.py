@@ -24,8 +24,6 @@ from drocap_ros.flight.vehicle import VehicleState
 
 _SENT_S = 0.7  # a setpoint may be echoed for so long at most: two transmissions and the period of the echo
 _ECHOED_S = 0.25  # two periods of the echo, and a step: beyond its age and two transmissions, and without agreement
-_STANDS_M_S = 1e-3  # of a target: the time-out writes zeros
-_AHEAD_S = 0.5  # along its velocity, by which the echoed place may be ahead
 #: Window in s, least commanded speed in m/s, and share of the commanded speed below which the vehicle stands for all
 #: of the window.  In every recorded flight of the orbit it reached 0.46, and along the command, with the way, 0.27.
 _BY_SPEED, _BY_WAY = (1.0, 0.6, 0.25), (2.0, 0.6, 0.15)
@@ -150,7 +148,8 @@ class Keeping:
 
 def _stands(target: Message) -> bool:
     """Whether a target has no velocity."""
-    return math.hypot(target.vx, target.vy) < _STANDS_M_S
+    # The time-out writes zeros.
+    return math.hypot(target.vx, target.vy) < 1e-3
 
 
 def _agrees(echo: Message, sent: list[Message], most: Autopilot) -> bool:
@@ -160,7 +159,8 @@ def _agrees(echo: Message, sent: list[Message], most: Autopilot) -> bool:
         return False
     begin = np.array([[m.x, m.y] for m in sent], dtype=float)
     velocity = np.array([[m.vx, m.vy] for m in sent], dtype=float)
-    way = _AHEAD_S * velocity
+    # The echoed place may be ahead along the velocity by half a second.
+    way = 0.5 * velocity
     part = ((place - begin) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-9)
     nearest = begin + np.clip(part, 0.0, 1.0)[:, None] * way
     near = np.hypot(*(place - nearest).T) <= most.echo_m

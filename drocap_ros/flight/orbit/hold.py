@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from drocap_ros.flight.bridge_config import SafetyConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import PICTURE_CODES, Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
@@ -16,7 +16,6 @@ from drocap_ros.flight.orbit.states import (
     Commanding,
     Fault,
     Holding,
-    Limits,
     Orbiting,
     Requesting,
     SafetyState,
@@ -154,27 +153,27 @@ def update_hold(state: Holding, seen: Observed, now_s: float, blind: bool) -> Ho
     return Fault(**{**vars(state), "since_s": now_s, "condition": reason})
 
 
-def retreat(state: Holding, seen: Observed, now_s: float, limits: Limits) -> Holding:
+def retreat(state: Holding, seen: Observed, now_s: float, config: MavlinkBridgeConfig) -> Holding:
     """Move the hold position away from an approaching subject, at most to the fence, and never nearer to the subject.
 
     Only a subject that is located counts, and only until the autopilot's hold mode has been requested.
     """
-    place, subject, fence, safety = state.position, seen.subject.position, state.fence_centre, limits.safety
+    place, subject, fence = state.position, seen.subject.position, state.fence_centre
     settled = not state.retreats or state.blind or state.hold_mode_s is not None or seen.mode.in_hold
-    if place is None or subject is None or fence is None or settled or not subject_located(seen, safety):
+    if place is None or subject is None or fence is None or settled or not subject_located(seen, config):
         return state
-    wanted = limits.orbit.min_distance_m + seen.subject.sd_m + _LEAD_S * max(seen.subject.approach_m_s, 0.0) + _CLEAR_M
+    wanted = config.min_distance_m + seen.subject.sd_m + _LEAD_S * max(seen.subject.approach_m_s, 0.0) + _CLEAR_M
     if not seen.subject.distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
         return state
     outward = (seen.vehicle.position - subject)[:2] / max(seen.subject.distance_m, 1e-3)
     here = seen.vehicle.position
     step = subject[:2] + wanted * outward - here[:2]
     step *= min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
-    target = here[:2] + _share_inside(here, step, fence, safety.fence_radius_m) * step
+    target = here[:2] + _share_inside(here, step, fence, config.fence_radius_m) * step
     return dataclasses.replace(state, position=np.append(target, place[2]), retreated_s=now_s)
 
 
-def request_hold_mode(state: Holding, seen: Observed, now_s: float, config: SafetyConfig) -> Holding:
+def request_hold_mode(state: Holding, seen: Observed, now_s: float, config: MavlinkBridgeConfig) -> Holding:
     """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``; not on a lossy link."""
     awaited = not isinstance(state, Fault) and state.hold_mode_s is None and not state.sight.lost
     if not awaited or state.blind or seen.link.packet_loss > MAX_LOSS:
@@ -188,14 +187,14 @@ def request_hold_mode(state: Holding, seen: Observed, now_s: float, config: Safe
     return dataclasses.replace(state, hold_mode_s=now_s) if ready else state
 
 
-def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
+def watch(state: SafetyState, seen: Observed, now_s: float, config: MavlinkBridgeConfig) -> SafetyState:
     """Note when the vehicle is lost from sight, and when it is in sight again.
 
     In sight again means that a heartbeat has arrived since the loss: fresh attitude with the mode of before the loss
     shows nothing of what the pilot has chosen meanwhile.
     """
     lost_s, seen_s = state.sight
-    if not _telemetry_fresh(seen, limits):
+    if not _telemetry_fresh(seen, config):
         return state if lost_s is not None else dataclasses.replace(state, sight=Sight(now_s, seen_s))
     if lost_s is None or seen.link.heartbeat_age_s >= now_s - lost_s:
         return state
@@ -210,16 +209,16 @@ def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> S
     return dataclasses.replace(state, position=seen.vehicle.position.copy() if known else None, yaw=seen.vehicle.yaw)
 
 
-def mode_visible(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> bool:
+def mode_visible(state: SafetyState, seen: Observed, now_s: float, config: MavlinkBridgeConfig) -> bool:
     """Whether a mode may be requested now: the present one has just been reported, by a link that works both ways.
 
     The pilot's choice within the age of this report is the only one that a request can override.  Where many packets
     are lost none is requested: such a link ends orbits, and the pilot takes over just then.
     """
     steady = now_s - state.sight.seen_s >= _STEADY_S and not state.sight.lost
-    late = seen.link.round_trip_s > limits.safety.max_round_trip_s  # the request would arrive late too
+    late = seen.link.round_trip_s > config.max_round_trip_s  # the request would arrive late too
     return (
-        steady and not late and seen.link.packet_loss <= MAX_LOSS and seen.link.heartbeat_age_s <= limits.max_mode_age_s
+        steady and not late and seen.link.packet_loss <= MAX_LOSS and seen.link.heartbeat_age_s <= config.max_mode_age_s
     )
 
 
@@ -248,8 +247,7 @@ def stream_ended(seen: Observed) -> bool:
     return seen.link.stream_gap_s > (_DEFAULT_TIMEOUT_S if math.isnan(timeout_s) else timeout_s)
 
 
-def _telemetry_fresh(seen: Observed, limits: Limits) -> bool:
+def _telemetry_fresh(seen: Observed, config: MavlinkBridgeConfig) -> bool:
     # The attitude's stamp shows packets that arrive late; a heartbeat has no stamp.
-    safety = limits.safety
     newest = max(seen.link.age_s, seen.vehicle.age_s)
-    return newest <= safety.max_state_age_s and seen.link.heartbeat_age_s <= safety.max_heartbeat_age_s
+    return newest <= config.max_state_age_s and seen.link.heartbeat_age_s <= config.max_heartbeat_age_s

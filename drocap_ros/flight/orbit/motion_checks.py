@@ -9,10 +9,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import supported_titles
 from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
-from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig, OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.flight.observed import FIX_3D, Observed
-from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.vehicle import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
 _C = ConditionCode
@@ -34,23 +33,22 @@ _EMERGENCIES = {
 LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
 
 
-def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) -> Condition | None:
+def vehicle_condition(seen: Observed, config: MavlinkBridgeConfig, *, patient: bool = False) -> Condition | None:
     """Why the vehicle must not be commanded; None = it may.
 
     patient : of an orbit that is flown: gaps of telemetry slow it down before they end it
     """
-    safety = limits.safety
-    if not safety.commands_enabled:
+    if not config.commands_enabled:
         return condition(_C.COMMANDS_DISABLED)
-    oldest_s = oldest_state_s(safety, patient=patient)
-    silent = 0.0 < safety.operator_timeout_s < seen.operator_age_s
+    oldest_s = oldest_state_s(config, patient=patient)
+    silent = 0.0 < config.operator_timeout_s < seen.operator_age_s
     return (
         seen.disturbance
         or (stalled_condition(seen) if seen.stalled_s and not patient else None)
-        or _autopilot_condition(seen, limits, oldest_s)
-        or _state_condition(seen, safety, oldest_s)
-        or _health_condition(seen, safety)
-        or battery_condition(seen.health.battery_fraction, seen.health.battery_voltage_v, safety)
+        or _autopilot_condition(seen, config, oldest_s)
+        or _state_condition(seen, config, oldest_s)
+        or _health_condition(seen, config)
+        or battery_condition(seen.health.battery_fraction, seen.health.battery_voltage_v, config)
         or seen.pictures.camera_problem
         or seen.intruder
         or (condition(_C.OPERATOR_SILENT, age_s=seen.operator_age_s) if silent else None)
@@ -62,13 +60,13 @@ def stalled_condition(seen: Observed) -> Condition:
     return condition(_C.CONTROL_LOOP_STALLED, gap_s=seen.stalled_s)
 
 
-def _autopilot_condition(seen: Observed, limits: Limits, oldest_s: float) -> Condition | None:
+def _autopilot_condition(seen: Observed, config: MavlinkBridgeConfig, oldest_s: float) -> Condition | None:
     """Whether an autopilot is heard that the bridge flies, and whose setting for the loss of setpoints is safe."""
     if seen.link.age_s > oldest_s:
         return condition(_C.LINK_SILENT, age_s=seen.link.age_s)
     if not seen.autopilot.supported:
         return condition(_C.AUTOPILOT_UNSUPPORTED, autopilot=seen.autopilot_name, supported=supported_titles())
-    return loss_condition(seen.loss_settings, seen.autopilot.loss_action, limits.max_control_timeout_s)
+    return loss_condition(seen.loss_settings, seen.autopilot.loss_action, config.max_control_timeout_s)
 
 
 def _state_condition(seen: Observed, safety: SafetyConfig, oldest_s: float) -> Condition | None:
@@ -157,28 +155,27 @@ def loss_condition(settings: LossSettings | None, meaning: LossAction | None, lo
     return None
 
 
-def limit_condition(seen: Observed, fence_centre: np.ndarray | None, limits: Limits) -> Condition | None:
+def limit_condition(seen: Observed, fence_centre: np.ndarray | None, config: MavlinkBridgeConfig) -> Condition | None:
     """Which limit of place or speed is reached, the braking distance included; the vehicle's state must be known."""
-    safety = limits.safety
     speed = math.sqrt(seen.vehicle.velocity @ seen.vehicle.velocity)
-    if speed > safety.speed_margin * limits.orbit.max_speed_m_s:
+    if speed > config.speed_margin * config.max_speed_m_s:
         return condition(_C.TOO_FAST, speed_m_s=speed)
     climb = float(seen.vehicle.velocity[2])
-    margin = braking_distance(climb, safety)
+    margin = braking_distance(climb, config)
     height_m = seen.vehicle.height.m
-    if height_m + (margin if climb > 0 else 0.0) > safety.max_height_m:
-        return condition(_C.TOO_HIGH, height_m=height_m, limit_m=safety.max_height_m)
+    if height_m + (margin if climb > 0 else 0.0) > config.max_height_m:
+        return condition(_C.TOO_HIGH, height_m=height_m, limit_m=config.max_height_m)
     if (contradicted := contradicted_height(seen, lower=True)) is not None:
         return contradicted
     source, lowest = min(seen.heights.items(), key=lambda row: row[1].m, default=("unknown", seen.vehicle.height))
-    if not lowest.m - (margin if climb < 0 else 0.0) >= safety.min_height_m:
-        return condition(_C.TOO_LOW, height_m=lowest.m, source=source, limit_m=safety.min_height_m)
+    if not lowest.m - (margin if climb < 0 else 0.0) >= config.min_height_m:
+        return condition(_C.TOO_LOW, height_m=lowest.m, source=source, limit_m=config.min_height_m)
     if fence_centre is not None:
         offset = seen.vehicle.position[:2] - fence_centre
         distance = float(np.hypot(*offset))
         outward = max(float(offset @ seen.vehicle.velocity[:2]) / max(distance, 1e-6), 0.0)
-        if distance + braking_distance(outward, safety) > safety.fence_radius_m:
-            return condition(_C.AT_FENCE, distance_m=distance, limit_m=safety.fence_radius_m)
+        if distance + braking_distance(outward, config) > config.fence_radius_m:
+            return condition(_C.AT_FENCE, distance_m=distance, limit_m=config.fence_radius_m)
     return None
 
 
@@ -195,12 +192,14 @@ def contradicted_height(seen: Observed, *, lower: bool = False) -> Condition | N
     return None
 
 
-def keeping_condition(seen: Observed, limits: Limits, longest_s: float = _LONGEST_AWAY_S) -> Condition | None:
+def keeping_condition(
+    seen: Observed, config: MavlinkBridgeConfig, longest_s: float = _LONGEST_AWAY_S
+) -> Condition | None:
     """Why the vehicle counts as unable to keep the orbit, after ``longest_s`` away from its place; None = it is not.
 
     Sooner at three times the distance: the vehicle is carried off.
     """
-    limit_m = away_limit_m(limits.orbit)
+    limit_m = away_limit_m(config)
     carried_off = seen.course.away_m > _CARRIED_OFF * limit_m
     if carried_off:
         longest_s = min(longest_s, GUST_S)
@@ -220,28 +219,27 @@ def away_limit_m(orbit: OrbitConfig) -> float:
     return WAITING_LEADS * orbit.max_lead_m
 
 
-def subject_condition(seen: Observed, limits: Limits, *, patient: bool = False) -> Condition | None:
+def subject_condition(seen: Observed, config: MavlinkBridgeConfig, *, patient: bool = False) -> Condition | None:
     """Why the subject's position does not allow motion; None = it does.
 
     patient : of an orbit that is flown: late pictures slow it down, and stop it, before they end it; pictures of
         something else end it as before
     """
-    safety = limits.safety
     if seen.subject.position is None:
         return condition(_C.NO_SUBJECT if seen.pictures.calibrated else _C.NO_CAMERA_INFO)
-    oldest_s = oldest_subject_s(seen, safety)
+    oldest_s = oldest_subject_s(seen, config)
     if patient and not seen.subject.contradicted:
-        oldest_s = max(oldest_s, safety.max_subject_gap_s)
+        oldest_s = max(oldest_s, config.max_subject_gap_s)
     if not -_FUTURE_S < seen.subject.age_s <= oldest_s:
         return outdated_condition(seen, oldest_s)
-    if not seen.subject.sd_m <= safety.max_subject_sd_m:
+    if not seen.subject.sd_m <= config.max_subject_sd_m:
         return condition(_C.SUBJECT_UNCERTAIN, sd_m=seen.subject.sd_m)
-    near, room_m = seen.subject, stopping_room(seen, safety)
-    if not near.distance_m - room_m >= limits.orbit.min_distance_m:
-        values = {"distance_m": near.distance_m, "sd_m": near.sd_m, "limit_m": limits.orbit.min_distance_m}
+    near, room_m = seen.subject, stopping_room(seen, config)
+    if not near.distance_m - room_m >= config.min_distance_m:
+        values = {"distance_m": near.distance_m, "sd_m": near.sd_m, "limit_m": config.min_distance_m}
         return condition(_C.SUBJECT_NEAR, room_m=room_m, **values)
-    if seen.subject.distance_m > limits.orbit.max_distance_m:
-        return condition(_C.SUBJECT_FAR, distance_m=seen.subject.distance_m, limit_m=limits.orbit.max_distance_m)
+    if seen.subject.distance_m > config.max_distance_m:
+        return condition(_C.SUBJECT_FAR, distance_m=seen.subject.distance_m, limit_m=config.max_distance_m)
     return None
 
 

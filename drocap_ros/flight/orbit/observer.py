@@ -36,9 +36,6 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.stamps import NS
 
-_CLOCK_JUMP_S = 0.25  # between the clock of the stamps and the monotonic one: a subject's age would be wrong by it
-_MAX_EXTRAPOLATION_S = 0.3  # of a position by its velocity
-_WAITING = 16  # pictures that wait for the camera's attitude: half a second at 30 Hz, older than any that is flown by
 #: MAV_TYPE of the vehicles for which the control was made: multirotors, and a helicopter under the same autopilot.
 _MULTIROTORS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 _STATUS_MESSAGES = (("GPS_RAW_INT",), ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), ("SYS_STATUS",))
@@ -80,7 +77,8 @@ class Observer:
         self._history, self._pictures = PoseHistory(), PictureWatch()
         self._subject, self._guard = SubjectFilter(config), Guard(config)
         self._following, self._keeping = Following(config.max_echo_age_s), Keeping(config)
-        self._waiting: deque[tuple[PoseObservation, bool]] = deque(maxlen=_WAITING)
+        # Pictures wait for the camera's attitude: half a second at 30 Hz, older than any that is flown by.
+        self._waiting: deque[tuple[PoseObservation, bool]] = deque(maxlen=16)
         self._before: tuple[int, float] | None = None  # stamp and monotonic time of the last step
         self._camera_changed: Condition | None = None  # since the last step
 
@@ -183,7 +181,8 @@ class Observer:
         if before is None:
             return self._camera_changed or own.unsafe
         jump_s = (now_ns - before[0]) / NS - dt
-        if abs(jump_s) > _CLOCK_JUMP_S:
+        # A subject's age would be wrong by a jump between the clock of the stamps and the monotonic one.
+        if abs(jump_s) > 0.25:
             return condition(ConditionCode.CLOCK_JUMPED, jump_s=jump_s)
         doubt, self._doubt = self._doubt, Doubt()
         if doubt.jump_m > 0:
@@ -207,7 +206,8 @@ def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: Veh
     vehicle_type = estimator.modes.vehicle_type
     flies = vehicle_type in _MULTIROTORS
     # The state is at the attitude's stamp; a moment later the vehicle is a little farther.
-    moved_s = min(max(age_s, 0.0), _MAX_EXTRAPOLATION_S)
+    # A velocity extrapolates no farther.
+    moved_s = min(max(age_s, 0.0), 0.3)
     velocity = vehicle.velocity_enu_m_s
     moves = velocity if np.isfinite(velocity).all() else np.nan_to_num(velocity)
     position = vehicle.position_enu_m + moves * moved_s

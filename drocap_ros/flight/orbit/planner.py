@@ -22,12 +22,8 @@ from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 _TRIM_RATE = 0.15  # 1/s, about one who stands
 _WALKING_TRIM_RATE = 0.03  # 1/s: the turns of one who walks are no lasting error
 _CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
-_CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
-_FORWARD_S = 0.5  # s; filter of the centre's acceleration
 _FORWARD = 0.5  # m/s^2: most of it that is passed on, from 1 m/s beyond one who stands: slower, it is noise
 _MAX_HASTE = 0.12  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
-_CALIBRATION_S = 15.0  # against the wanted direction, with calibrate_telemetry
-_WORST_RANGE = 5.0  # of size_error: 40 % where the body is not measured, as by a wrong lens or a child
 
 
 class Ramp(NamedTuple):
@@ -80,7 +76,8 @@ def least_radius(
     """
     speed = min(max(subject_speed_m_s - STANDING_M_S, 0.0), config.max_subject_speed_m_s)
     surprise = max(REACTION_S * speed, speed**2 / (2 * braking_m_s2))
-    worst = _WORST_RANGE * size_error * config.min_distance_m
+    # A range errs by five of them at worst: by 40 % where the body is not measured, as by a wrong lens or a child.
+    worst = 5.0 * size_error * config.min_distance_m
     nearer = max(2 * subject_sd_m, nearer_m + subject_sd_m, worst)
     return config.min_distance_m + nearer + surprise + FLIGHT_ERROR_M
 
@@ -162,7 +159,8 @@ def sense(config: OrbitConfig, flown_s: float) -> float:
     """1, or -1 while the orbit is flown against its direction: a one-way orbit cannot separate yaw from latency."""
     if config.reverse_every_s > 0:
         return -1.0 if int(flown_s / config.reverse_every_s) % 2 else 1.0
-    return -1.0 if config.calibrate_telemetry and flown_s < _CALIBRATION_S else 1.0
+    # The first 15 s go against the wanted direction.
+    return -1.0 if config.calibrate_telemetry and flown_s < 15.0 else 1.0
 
 
 def reference_position(state: OrbitState) -> np.ndarray:
@@ -230,10 +228,12 @@ def _follow(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centre that follows the subject: critically damped, limited in speed and acceleration against jumps."""
     pull = _CENTRE_RATE**2 * (subject - state.centre) + 2 * _CENTRE_RATE * (velocity - state.centre_velocity)
-    acceleration = _limited(pull, _CENTRE_ACCELERATION)
+    # No subject accelerates by 8 m/s^2, so this limits only jumps.
+    acceleration = _limited(pull, 8.0)
     moved = _limited(state.centre_velocity + acceleration * dt, config.max_subject_speed_m_s)
     change = (moved - state.centre_velocity) / dt
-    filtered = state.centre_acceleration + (change - state.centre_acceleration) * min(dt / _FORWARD_S, 1.0)
+    # The centre's acceleration is filtered over half a second.
+    filtered = state.centre_acceleration + (change - state.centre_acceleration) * min(dt / 0.5, 1.0)
     return state.centre + 0.5 * (state.centre_velocity + moved) * dt, moved, filtered
 
 

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.reports import MAX_LOSS
 from drocap_ros.flight.mavlink.telemetry_request import CURRENT_MODE_HZ
@@ -38,7 +39,6 @@ from drocap_ros.flight.orbit.states import (
     Fault,
     Holding,
     Idle,
-    Limits,
     ModeRequest,
     Orbiting,
     Pace,
@@ -55,7 +55,7 @@ _INTENTION_S = 2.0 / CURRENT_MODE_HZ  # two periods of CURRENT_MODE, which says 
 
 
 def reduce(
-    state: SafetyState, seen: Observed, now_s: float, command: Command | None, limits: Limits
+    state: SafetyState, seen: Observed, now_s: float, command: Command | None, config: MavlinkBridgeConfig
 ) -> tuple[SafetyState, Decision]:
     """One step of the machine.
 
@@ -66,34 +66,34 @@ def reduce(
     -------
     The next state, and what may be sent until the step after it.
     """
-    state = watch(state, seen, now_s, limits)
+    state = watch(state, seen, now_s, config)
     sight = state.sight
     state = _by_mode(state, seen, now_s)
-    vehicle, place, problem = _problems(state, seen, limits)
+    vehicle, place, problem = _problems(state, seen, config)
     answer = None
     if command is not None:
-        state, answer = _execute(state, seen, now_s, command, problem, limits)
+        state, answer = _execute(state, seen, now_s, command, problem, config)
     if isinstance(state, Orbiting):
-        state = _orbit(state, seen, now_s, vehicle is not None, limits)
+        state = _orbit(state, seen, now_s, vehicle is not None, config)
     elif isinstance(state, Requesting):
-        state = _request(state, seen, now_s, problem, limits)
+        state = _request(state, seen, now_s, problem, config)
     elif isinstance(state, Idle):
-        state = _wait(state, seen, now_s, problem, limits)
+        state = _wait(state, seen, now_s, problem, config)
     elif isinstance(state, Holding) and not stream_ended(seen):
         state = update_hold(state, seen, now_s, vehicle is not None)
-        moved = state if vehicle or place else retreat(state, seen, now_s, limits)
-        state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
+        moved = state if vehicle or place else retreat(state, seen, now_s, config)
+        state = moved if moved is not state else request_hold_mode(state, seen, now_s, config)
     state = dataclasses.replace(state, sight=sight)
-    return state, Decision(*_permitted(state, seen, now_s, limits), answer)
+    return state, Decision(*_permitted(state, seen, now_s, config), answer)
 
 
 def _problems(
-    state: SafetyState, seen: Observed, limits: Limits
+    state: SafetyState, seen: Observed, config: MavlinkBridgeConfig
 ) -> tuple[Condition | None, Condition | None, Condition | None]:
     """Why vehicle and place forbid motion, and the first cause of all that no orbit may begin."""
-    vehicle = vehicle_condition(seen, limits)
-    place = None if vehicle else limit_condition(seen, _fence(state), limits)
-    return vehicle, place, vehicle or place or subject_condition(seen, limits) or start_condition(seen)
+    vehicle = vehicle_condition(seen, config)
+    place = None if vehicle else limit_condition(seen, _fence(state), config)
+    return vehicle, place, vehicle or place or subject_condition(seen, config) or start_condition(seen)
 
 
 def _fence(state: SafetyState) -> np.ndarray | None:
@@ -129,15 +129,15 @@ def _returned(state: SafetyState, seen: Observed) -> bool:
     )
 
 
-def _orbit(state: Orbiting, seen: Observed, now_s: float, blind: bool, limits: Limits) -> SafetyState:
+def _orbit(state: Orbiting, seen: Observed, now_s: float, blind: bool, config: MavlinkBridgeConfig) -> SafetyState:
     """Slow the orbit down by the age of the data, or end it."""
-    problem = _ending(state, seen, limits) or keeping_condition(seen, limits)
-    if 0.0 < (limit_s := limits.safety.max_orbit_s) < now_s - state.since_s:
+    problem = _ending(state, seen, config) or keeping_condition(seen, config)
+    if 0.0 < (limit_s := config.max_orbit_s) < now_s - state.since_s:
         problem = problem or condition(_C.ORBIT_TIME_OVER, limit_s=limit_s)
     if problem:
         near = problem.code == _C.SUBJECT_NEAR
-        return begin_hold(state, problem, seen, now_s, limits.safety.fence_radius_m, blind=blind, retreats=near)
-    allowed, cause = allowed_pace(seen, limits)
+        return begin_hold(state, problem, seen, now_s, config.fence_radius_m, blind=blind, retreats=near)
+    allowed, cause = allowed_pace(seen, config)
     pace = next_pace(state.pace, allowed, now_s, seen.vehicle.position, contradicted=seen.subject.contradicted)
     reason = state.condition
     if cause is not None:
@@ -147,11 +147,11 @@ def _orbit(state: Orbiting, seen: Observed, now_s: float, blind: bool, limits: L
     return dataclasses.replace(state, pace=pace, condition=reason)
 
 
-def _ending(state: SafetyState, seen: Observed, limits: Limits) -> Condition | None:
+def _ending(state: SafetyState, seen: Observed, config: MavlinkBridgeConfig) -> Condition | None:
     """Why an orbit that is flown or requested must end; gaps of the data end it later than they forbid its start."""
-    vehicle = vehicle_condition(seen, limits, patient=True)
-    place = None if vehicle else limit_condition(seen, _fence(state), limits)
-    return vehicle or place or subject_condition(seen, limits, patient=True)
+    vehicle = vehicle_condition(seen, config, patient=True)
+    place = None if vehicle else limit_condition(seen, _fence(state), config)
+    return vehicle or place or subject_condition(seen, config, patient=True)
 
 
 def _yield(state: SafetyState, seen: Observed, mode: str, now_s: float) -> SafetyState:
@@ -182,13 +182,18 @@ def permit_mode(state: SafetyState, mode: str) -> SafetyState:
 
 
 def _execute(
-    state: SafetyState, seen: Observed, now_s: float, command: Command, problem: Condition | None, limits: Limits
+    state: SafetyState,
+    seen: Observed,
+    now_s: float,
+    command: Command,
+    problem: Condition | None,
+    config: MavlinkBridgeConfig,
 ) -> tuple[SafetyState, CommandAnswer]:
     if command == Command.PRESENT:
         return state, _accepted(_C.NONE)
     state = dataclasses.replace(state, failed=None, asked_s=-math.inf) if isinstance(state, Idle) else state
     if command == Command.STOP:
-        return _stop(state, seen, now_s, limits)
+        return _stop(state, seen, now_s, config)
     if command == Command.ADJUST:
         if isinstance(state, Orbiting):
             return state, _accepted(_C.ADJUSTED)
@@ -201,7 +206,7 @@ def _execute(
         return state, _accepted(_C.ALREADY_REQUESTING_CONTROL)
     if seen.mode.in_control:
         return _begin_orbit(seen, now_s), _accepted(_C.ORBITING)
-    if (refused := _request_refusal(seen, command, limits)) is not None:
+    if (refused := _request_refusal(seen, command, config)) is not None:
         return state, refused
     answer = _accepted(_C.REQUESTING_CONTROL)
     place, modes = seen.vehicle.position.copy(), frozenset({seen.mode.name})
@@ -223,9 +228,9 @@ def _start_refusal(state: SafetyState, seen: Observed, problem: Condition | None
     return None
 
 
-def _request_refusal(seen: Observed, command: Command, limits: Limits) -> CommandAnswer | None:
+def _request_refusal(seen: Observed, command: Command, config: MavlinkBridgeConfig) -> CommandAnswer | None:
     """Why control may not be requested from the autopilot."""
-    if not limits.safety.mode_change_allowed:
+    if not config.mode_change_allowed:
         engaged = f" ({seen.autopilot.hints.engaged})" if seen.autopilot.hints.engaged else ""
         return _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode.name, engaged=engaged, by_hand=by_hand(seen))
     if command == Command.START:
@@ -235,11 +240,13 @@ def _request_refusal(seen: Observed, command: Command, limits: Limits) -> Comman
     return None
 
 
-def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[SafetyState, CommandAnswer]:
+def _stop(
+    state: SafetyState, seen: Observed, now_s: float, config: MavlinkBridgeConfig
+) -> tuple[SafetyState, CommandAnswer]:
     if isinstance(state, Orbiting) or (isinstance(state, Holding) and state.retreats and not isinstance(state, Fault)):
         answer = _accepted(_C.STOPPED)
-        blind = vehicle_condition(seen, limits) is not None
-        return begin_hold(state, answer.condition, seen, now_s, limits.safety.fence_radius_m, blind=blind), answer
+        blind = vehicle_condition(seen, config) is not None
+        return begin_hold(state, answer.condition, seen, now_s, config.fence_radius_m, blind=blind), answer
     if isinstance(state, TakenOver | Fault | Requesting):
         requested = isinstance(state, Requesting)
         answer = _accepted(_C.STOPPED if requested else _C.ACKNOWLEDGED)
@@ -249,32 +256,36 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
     return state, _accepted(_C.NOT_ORBITING)
 
 
-def _request(state: Requesting, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
+def _request(
+    state: Requesting, seen: Observed, now_s: float, problem: Condition | None, config: MavlinkBridgeConfig
+) -> SafetyState:
     """While control is requested; a short gap of the data delays the orbit.
 
     The vehicle is held where it is, not where it was when control was asked for: the pilot flies it until the
     autopilot grants control, and that is seen late.
     """
-    cause = _ending(state, seen, limits)
+    cause = _ending(state, seen, config)
     if cause is None:
         state = dataclasses.replace(state, position=seen.vehicle.position.copy(), yaw=seen.vehicle.yaw)
         if seen.mode.in_control and not problem:
             return _begin_orbit(seen, now_s)
-        if now_s - state.since_s <= limits.safety.engage_timeout_s + limits.warm_up_s:
+        if now_s - state.since_s <= config.engage_timeout_s + seen.autopilot.warm_up_s:
             return state
         cause = problem if seen.mode.in_control else None  # with the mode granted, it has delayed the orbit so long
     failed = condition(_C.REQUEST_ENDED, cause=cause) if cause else _not_granted(seen)
     ended = (Idle if problem else Ready)(now_s, failed, failed=failed, asked_s=now_s)
-    return _wait(ended, seen, now_s, problem, limits)
+    return _wait(ended, seen, now_s, problem, config)
 
 
-def _wait(state: Idle, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
+def _wait(
+    state: Idle, seen: Observed, now_s: float, problem: Condition | None, config: MavlinkBridgeConfig
+) -> SafetyState:
     """Idle and ready; control that is granted when nobody asks for it any more is held, and handed on."""
-    if seen.mode.in_control and now_s - state.asked_s <= limits.safety.engage_timeout_s:
-        blind = vehicle_condition(seen, limits) is not None
+    if seen.mode.in_control and now_s - state.asked_s <= config.engage_timeout_s:
+        blind = vehicle_condition(seen, config) is not None
         granted = Requesting(now_s, modes=frozenset({seen.mode.name}))
         reason = state.failed or state.condition
-        return begin_hold(granted, reason, seen, now_s, limits.safety.fence_radius_m, blind=blind)
+        return begin_hold(granted, reason, seen, now_s, config.fence_radius_m, blind=blind)
     reason = problem or state.failed or condition(_C.ALL_CLEAR)
     wanted = Idle if problem else Ready
     if (type(state), state.condition) == (wanted, reason):
@@ -289,30 +300,34 @@ def _not_granted(seen: Observed) -> Condition:
     return condition(_C.CONTROL_NOT_GRANTED, answer=f" ({answer})" if answer else "")
 
 
-def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:
+def _permitted(
+    state: SafetyState, seen: Observed, now_s: float, config: MavlinkBridgeConfig
+) -> tuple[Action, ModeRequest]:
     if isinstance(state, Orbiting):
         return Action.ORBIT, ModeRequest.NONE
     if isinstance(state, Requesting):
         # Where the autopilot still intends the control mode, setpoints alone end the failsafe for their loss.  A
         # request would end any other failsafe, too: the autopilot takes it for a pilot who takes over.
-        own_loss, warm = seen.mode.left_by_itself, now_s - state.since_s >= limits.warm_up_s
-        wanted = warm and not own_loss and start_condition(seen) is None and mode_visible(state, seen, now_s, limits)
+        own_loss, warm = seen.mode.left_by_itself, now_s - state.since_s >= seen.autopilot.warm_up_s
+        wanted = warm and not own_loss and start_condition(seen) is None and mode_visible(state, seen, now_s, config)
         return Action.HOLD, ModeRequest.CONTROL if wanted else ModeRequest.NONE
     unseen_s = 0.0 if state.sight.lost_s is None else now_s - state.sight.lost_s
-    silent = not seen.mode.in_control or unseen_s > limits.safety.blind_hold_s or stream_ended(seen)
+    silent = not seen.mode.in_control or unseen_s > config.blind_hold_s or stream_ended(seen)
     if isinstance(state, Holding) and not silent:
-        return _permitted_in_hold(state, seen, now_s, limits)
+        return _permitted_in_hold(state, seen, now_s, config)
     return Action.NOTHING, ModeRequest.NONE
 
 
-def _permitted_in_hold(state: Holding, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:
+def _permitted_in_hold(
+    state: Holding, seen: Observed, now_s: float, config: MavlinkBridgeConfig
+) -> tuple[Action, ModeRequest]:
     action, since = Action.HALT if state.position is None else Action.HOLD, now_s - state.since_s
     if state.blind and since >= GIVE_UP_S:
         action = Action.NOTHING
     # Not at once: the autopilot's brake takes longer than velocity zero.  And not without a visible mode: the pilot
     # may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
     wanted = since > _BLIND_MODE_REQUEST_S if state.blind else state.hold_mode_s is not None
-    return action, ModeRequest.HOLD if wanted and mode_visible(state, seen, now_s, limits) else ModeRequest.NONE
+    return action, ModeRequest.HOLD if wanted and mode_visible(state, seen, now_s, config) else ModeRequest.NONE
 
 
 def _begin_orbit(seen: Observed, now_s: float) -> Orbiting:
@@ -334,7 +349,7 @@ def by_hand(seen: Observed) -> str:
     return f", or {seen.autopilot.hints.by_hand}" if seen.autopilot.hints.by_hand else ""
 
 
-def way_out(state: SafetyState, seen: Observed, limits: Limits) -> str:
+def way_out(state: SafetyState, seen: Observed, config: MavlinkBridgeConfig) -> str:
     """What the operator may do next, as a sentence; "" = nothing leads out, or the condition says it.
 
     A command that it names is accepted now.
@@ -344,9 +359,9 @@ def way_out(state: SafetyState, seen: Observed, limits: Limits) -> str:
     if not isinstance(state, Ready | Holding):
         return ""
     command = Command.START if seen.mode.in_control else Command.ENGAGE
-    refused = _start_refusal(state, seen, _problems(state, seen, limits)[2])
+    refused = _start_refusal(state, seen, _problems(state, seen, config)[2])
     if refused is None and command == Command.ENGAGE:
-        refused = _request_refusal(seen, command, limits)
+        refused = _request_refusal(seen, command, config)
     if refused is not None:
         return "" if refused.condition.code == state.condition.code else str(refused.condition)
     if command == Command.ENGAGE:

@@ -29,7 +29,7 @@ from drocap_ros.flight.orbit.planner import (
     setpoint_of,
 )
 from drocap_ros.flight.orbit.speed import coast_speed, limit_closing, slowed, slowed_condition, timeout_s
-from drocap_ros.flight.orbit.states import Limits, Orbiting, Pace
+from drocap_ros.flight.orbit.states import Orbiting, Pace
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
@@ -69,8 +69,8 @@ class FlownOrbit:
     unsafe : why the last setpoint was not sent; None = it was
     """
 
-    def __init__(self, config: MavlinkBridgeConfig, limits: Limits) -> None:
-        self._config, self._limits = config, limits
+    def __init__(self, config: MavlinkBridgeConfig) -> None:
+        self._config = config
         self.goal: OrbitGoal = goal_of(config)
         self.unsafe: Condition | None = None
         self._reference: OrbitState | None = None
@@ -103,7 +103,7 @@ class FlownOrbit:
         if self._reference is None or seen.subject.position is None:
             return None
         planned = self.planned(self._reference, seen, framing, dt * safety.pace.value)
-        sent, self.unsafe = harmless(self.limited(planned, seen, safety.pace), seen, safety.fence_centre, self._limits)
+        sent, self.unsafe = harmless(self.limited(planned, seen, safety.pace), seen, safety.fence_centre, self._config)
         self._shortfall.learn(sent, seen, dt)
         return sent
 
@@ -117,14 +117,14 @@ class FlownOrbit:
         """The setpoint at this pace, with what a vehicle behind a walker lacks, bounded towards the subject."""
         assert self._reference is not None
         pushed = self._shortfall.added(planned, seen, self._reference.centre_velocity)
-        return limit_closing(slowed(pushed, pace, self._config.max_acceleration_m_s2), seen, self._limits)
+        return limit_closing(slowed(pushed, pace, self._config.max_acceleration_m_s2), seen, self._config)
 
     def flown_condition(self, present: Condition, seen: Observed) -> Condition:
         """The condition of the machine, with the radius and the speed that are flown where these are not the goal's."""
         if self._reference is None:
             return present
         widened, goal = _widened_condition(present, self.goal, self._reference, self._framed_radius_m, self._config)
-        return slowed_condition(widened, goal, seen, self._limits)
+        return slowed_condition(widened, goal, seen, self._config)
 
     def _scene(self, seen: Observed, framing: Framing) -> Scene:
         subject, config = seen.subject, self._config
@@ -140,7 +140,7 @@ class FlownOrbit:
             subject_velocity=subject.velocity,
             ground_m=config.ground_height_m + self._risen_m(seen),
             least_radius_m=max(least, self._framed_radius_m),
-            greatest_speed_m_s=coast_speed(seen, self._limits),
+            greatest_speed_m_s=coast_speed(seen, self._config),
         )
 
     def _risen_m(self, seen: Observed) -> float:
@@ -178,7 +178,7 @@ class _Coasting(NamedTuple):
     seen: Observed
     subject_velocity: complex
     fence_centre: np.ndarray | None
-    limits: Limits
+    config: MavlinkBridgeConfig
     longest_m: float
     fastest_m_s: float
 
@@ -210,18 +210,18 @@ class _Coasting(NamedTuple):
 
     def danger(self, coast: Coast) -> Condition | None:
         """The limit that the coast breaks; None = none."""
-        limits, place = self.limits, self.seen.subject.position
+        config, place = self.config, self.seen.subject.position
         speed = float(coast.speed_m_s.max())
-        if speed > max(limits.orbit.max_speed_m_s, float(coast.speed_m_s[0]) + OWN_SPEED_SD_M_S):
+        if speed > max(config.max_speed_m_s, float(coast.speed_m_s[0]) + OWN_SPEED_SD_M_S):
             return condition(ConditionCode.COAST_UNSAFE, reach=f"reach {speed:.1f} m/s")
         if self.fence_centre is not None:
             away = np.abs(coast.place - complex(*self.fence_centre))
-            if away.max() > max(limits.safety.fence_radius_m, float(away[0]) + _SLACK_M):
-                fence_m = limits.safety.fence_radius_m
+            if away.max() > max(config.fence_radius_m, float(away[0]) + _SLACK_M):
+                fence_m = config.fence_radius_m
                 return condition(ConditionCode.AT_FENCE, distance_m=float(away[0]), limit_m=fence_m)
         if place is None:
             return None
-        subject, least = complex(*place[:2]), limits.orbit.min_distance_m
+        subject, least = complex(*place[:2]), config.min_distance_m
         walked = subject + self.subject_velocity * coast.time_s
         stands, walks = np.abs(coast.place - subject), np.abs(coast.place - walked)
         alone = float(np.abs(coast.place[0] - walked).min())  # of a vehicle that stands
@@ -248,7 +248,7 @@ class _Coasting(NamedTuple):
 
 
 def harmless(
-    setpoint: Setpoint, seen: Observed, fence_centre: np.ndarray | None, limits: Limits
+    setpoint: Setpoint, seen: Observed, fence_centre: np.ndarray | None, config: MavlinkBridgeConfig
 ) -> tuple[Setpoint, Condition | None]:
     """The greatest part of the setpoint whose coast breaks no limit.
 
@@ -264,9 +264,9 @@ def harmless(
     fence_centre : (2,) m; None = there is no fence
     """
     held, velocity = not seen.autopilot.continues_setpoints, complex(*seen.subject.velocity[:2])
-    longest_m, steady_m_s = seen.autopilot.greatest_coast * limits.safety.max_coast_m, coast_speed(seen, limits)
+    longest_m, steady_m_s = seen.autopilot.greatest_coast * config.max_coast_m, coast_speed(seen, config)
     fastest_m_s = steady_m_s + _PULLED * (steady_m_s + abs(velocity)) if held else math.inf
-    judge = _Coasting(seen, velocity, fence_centre, limits, longest_m, fastest_m_s)
+    judge = _Coasting(seen, velocity, fence_centre, config, longest_m, fastest_m_s)
     across_first = seen.subject.position is not None and (held or abs(velocity) > WALKING_M_S)
     tries, problem = _TRIES_ACROSS_FIRST if across_first else _TRIES, None
     for i, (along, across) in enumerate(tries):

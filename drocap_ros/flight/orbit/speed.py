@@ -19,7 +19,7 @@ import numpy as np
 
 from drocap_ros.flight.autopilot.autopilot import Autopilot
 from drocap_ros.flight.autopilot.coasting import Setpoint
-from drocap_ros.flight.bridge_config import WORTH_TELLING, OrbitConfig, OrbitGoal
+from drocap_ros.flight.bridge_config import WORTH_TELLING, MavlinkBridgeConfig, OrbitConfig, OrbitGoal
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed, SizeSight
 from drocap_ros.flight.orbit.motion_checks import (
@@ -32,7 +32,7 @@ from drocap_ros.flight.orbit.motion_checks import (
     outdated_condition,
     stalled_condition,
 )
-from drocap_ros.flight.orbit.states import Limits, Pace
+from drocap_ros.flight.orbit.states import Pace
 from drocap_ros.flight.subject.guard import farness
 
 _C = ConditionCode
@@ -66,16 +66,16 @@ def timeout_s(seen: Observed) -> float:
     return seen.autopilot.timeout_s(seen.loss_settings)
 
 
-def coast_speed(seen: Observed, limits: Limits) -> float:
+def coast_speed(seen: Observed, config: MavlinkBridgeConfig) -> float:
     """Speed in m/s of a steady flight whose coast leaves room to ``max_coast_m``."""
     autopilot = seen.autopilot
-    return greatest_speed(autopilot, timeout_s(seen), autopilot.steady_coast * limits.safety.max_coast_m)
+    return greatest_speed(autopilot, timeout_s(seen), autopilot.steady_coast * config.max_coast_m)
 
 
-def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits: Limits) -> Condition:
+def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, config: MavlinkBridgeConfig) -> Condition:
     """The condition of a flown orbit, with the angular speed that is flown if the coast limits it."""
     wanted = abs(goal.angular_speed_rad_s)
-    allowed = coast_speed(seen, limits) / goal.radius_m
+    allowed = coast_speed(seen, config) / goal.radius_m
     if present.code not in (ConditionCode.ORBITING, ConditionCode.WIDENED) or allowed >= (1.0 - WORTH_TELLING) * wanted:
         return present
     return condition(
@@ -83,7 +83,7 @@ def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits
         cause=present,
         speed_deg_s=math.degrees(allowed),
         wanted_deg_s=math.degrees(wanted),
-        limit_m=limits.safety.max_coast_m,
+        limit_m=config.max_coast_m,
         timeout_s=timeout_s(seen),
     )
 
@@ -125,15 +125,14 @@ def approach_speed(radius_m: float, chase_m_s: float, config: OrbitConfig) -> fl
 # -- by the age of the data -------------------------------------------------------------------------------------------
 
 
-def allowed_pace(seen: Observed, limits: Limits) -> tuple[float, Condition | None]:
+def allowed_pace(seen: Observed, config: MavlinkBridgeConfig) -> tuple[float, Condition | None]:
     """The pace that the data allow, 0 to 1, by the greatest of the ages relative to their limits, and what reduces it.
 
     The ages are those of subject, attitude, position and link, and the stand of our own loop.
     """
-    safety = limits.safety
-    usual_s = safety.max_state_age_s
-    halt_s = 0.5 * (usual_s + oldest_state_s(safety, patient=True))
-    subject_s = min(oldest_subject_s(seen, safety), _STANDING_AGE * safety.max_subject_age_s)
+    usual_s = config.max_state_age_s
+    halt_s = 0.5 * (usual_s + oldest_state_s(config, patient=True))
+    subject_s = min(oldest_subject_s(seen, config), _STANDING_AGE * config.max_subject_age_s)
     usual_subject_s = min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s)
     ages = (
         (seen.link.age_s, _C.LINK_SILENT),
@@ -148,7 +147,7 @@ def allowed_pace(seen: Observed, limits: Limits) -> tuple[float, Condition | Non
         *((_share(age_s, usual_s, halt_s), condition(code, age_s=age_s)) for age_s, code in ages),
         key=lambda found: found[0],
     )
-    return (pace, cause) if pace < 1.0 else (1.0, keeping_condition(seen, limits, GUST_S))  # the reference waits itself
+    return (pace, cause) if pace < 1.0 else (1.0, keeping_condition(seen, config, GUST_S))  # the reference waits itself
 
 
 def _share(age_s: float, full_s: float, none_s: float) -> float:
@@ -224,15 +223,15 @@ class _Closing(NamedTuple):
 _CLOSING = _Closing()
 
 
-def limit_closing(setpoint: Setpoint, seen: Observed, limits: Limits) -> Setpoint:
+def limit_closing(setpoint: Setpoint, seen: Observed, config: MavlinkBridgeConfig) -> Setpoint:
     """The setpoint with no more speed towards the subject than his size allows."""
-    sight, orbit = seen.subject.by_size, limits.orbit
+    sight = seen.subject.by_size
     if sight is None:
         return setpoint
-    room = math.sqrt(2 * limits.safety.braking_m_s2 * max(sight.nearest_m - orbit.min_distance_m, 0.0))
+    room = math.sqrt(2 * config.braking_m_s2 * max(sight.nearest_m - config.min_distance_m, 0.0))
     receding = min(sight.receding_m_s, max(-seen.subject.approach_m_s, 0.0) + _CLOSING.surely_m_s)
     receding = min(receding, max(receding - farness(sight.distance_m) * _CLOSING.far_error_m_s, 0.0))
-    closing_up = _CLOSING.overshoot * orbit.max_closing_m_s
+    closing_up = _CLOSING.overshoot * config.max_closing_m_s
     allowed = min(max(closing_up + receding, 0.0), room)
     if seen.autopilot.continues_setpoints:
         closing = float(seen.vehicle.velocity[:2] @ sight.toward)
@@ -240,7 +239,7 @@ def limit_closing(setpoint: Setpoint, seen: Observed, limits: Limits) -> Setpoin
         # Its path, limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.3 m/s without this.
         allowed += min(closing, 0.0)
         allowed = max(min(allowed, max(closing, 0.0) + _CLOSING.step_m_s + receding), 0.0)
-    return _bounded(setpoint, seen, sight, allowed, orbit.max_acceleration_m_s2)
+    return _bounded(setpoint, seen, sight, allowed, config.max_acceleration_m_s2)
 
 
 def _bounded(

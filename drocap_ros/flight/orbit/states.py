@@ -9,7 +9,6 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.bridge_config import OrbitConfig, SafetyConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 
 
@@ -49,21 +48,6 @@ class ModeRequest(enum.Enum):
     NONE = ""
     CONTROL = "control"
     HOLD = "hold"
-
-
-class Limits(NamedTuple):
-    """Parameters of the conditions.
-
-    warm_up_s : how long the autopilot must receive setpoints before it grants control
-    max_control_timeout_s : longest time-out of the autopilot without setpoints; 0 = not checked
-    max_mode_age_s : greatest age of the report of the mode at which another one is requested
-    """
-
-    safety: SafetyConfig
-    orbit: OrbitConfig
-    warm_up_s: float = 0.0
-    max_control_timeout_s: float = 0.0
-    max_mode_age_s: float = 0.1
 
 
 class Pace(NamedTuple):

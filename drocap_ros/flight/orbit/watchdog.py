@@ -10,7 +10,6 @@ from drocap_ros.flight.mavlink.commands import Message
 
 _PERIOD_S = 0.1  # between setpoints: five within the autopilot's time-out of 0.5 s
 _CHECK_S = 0.02  # between looks at the loop: a tenth of watchdog_s
-_REQUEST_MODE_S = 3.0  # without a step: the vehicle stands by then, as after hold_s
 GIVE_UP_S = 10.0  # without a step: the hold mode was requested long ago, and the loop does not return
 _STOPPED_S = 0.5  # for which this thread stood too: the autopilot's time-out
 
@@ -73,7 +72,8 @@ class Watchdog:
             return
         self.fired, self._sent_s = True, now_s
         self._send(commands.hold)
-        if silent_s > _REQUEST_MODE_S and not self.mode_requested and commands.in_control():
+        # The vehicle stands 3 s after the last step, as after hold_s.
+        if silent_s > 3.0 and not self.mode_requested and commands.in_control():
             self.mode_requested = True
             self._send(commands.hold_mode)
 

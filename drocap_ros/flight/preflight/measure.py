@@ -22,7 +22,6 @@ from drocap_ros.flight.mavlink.transport import Address, Transport
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import start_condition, vehicle_condition
 from drocap_ros.flight.orbit.observer import observe_vehicle
-from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.preflight.findings import LASTING, Finding, Measured, Stream, check, graded
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
@@ -165,8 +164,7 @@ class Listening:
             seen = observe_vehicle(self.link, self._config, self._vehicle, now_ns)
         flying = dataclasses.replace(seen.health, armed=True, landed_state=LANDED_IN_AIR)
         seen = dataclasses.replace(seen, health=flying)
-        limits = Limits(self._config, self._config, max_control_timeout_s=self._config.max_control_timeout_s)
-        failed = vehicle_condition(seen, limits) or start_condition(seen)
+        failed = vehicle_condition(seen, self._config) or start_condition(seen)
         self._samples += 1
         if failed is not None:
             self._failed[failed.code] += 1

@@ -22,14 +22,11 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 _GRAVITY = 9.81  # m/s^2
 _HALF_WIDTH_M = 0.3  # of a person with the arms
 _HEADROOM_M = 0.1  # above the head
-_DIRECTIONS = 12  # of the nose against the wind: by 30 deg
 _GUSTS = 1.2  # times the lean by the mean wind
 _RESERVE_M_S2 = 0.4  # of corrections
 _LEAST_UP = 0.3  # of the body's axis; beyond it the vehicle tumbles
 _STILL_M_S = 0.5  # a hover: below it for so long, the vehicle leans by the wind alone
 _SETTLED_S = 1.0  # the lean of the braking before has gone
-_LEARNING_S = 4.0  # of the lean against wind: a gust passes, the wind stays
-_SAME_CAMERA = 0.03  # of the focal length, by which a camera matrix may change
 _CUT_OFF = 0.2  # share of the picture's height by which a mount may cut off feet or head: it does not lean further
 
 
@@ -88,7 +85,8 @@ def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float)
         none = np.zeros(1)
         return float(framing_margin(view, goal.radius_m, goal.height_m, body_height_m, none, none)[0])
     lean = _GUSTS * wind + _RESERVE_M_S2
-    around = np.linspace(0.0, 2 * math.pi, _DIRECTIONS, endpoint=False)
+    # Directions of the nose against the wind, by 30 deg.
+    around = np.linspace(0.0, 2 * math.pi, 12, endpoint=False)
     inward = np.array([[0.0], [goal.angular_speed_rad_s**2 * goal.radius_m]])
     ahead = np.arctan2(inward + lean * np.cos(around), _GRAVITY).ravel()
     left = np.arctan2(np.tile(lean * np.sin(around), 2), _GRAVITY)
@@ -131,7 +129,8 @@ class Framing:
             raise InputError("camera_info: expected a camera matrix with positive focal lengths; calibrate the camera")
         self.matrix, before = np.asarray(matrix, dtype=float), self._judged_by
         # Against the first one, so that slow changes add up.
-        if before is not None and np.abs(self.matrix - before).max() <= _SAME_CAMERA * before[0, 0]:
+        # A camera matrix may change by 3 % of the focal length.
+        if before is not None and np.abs(self.matrix - before).max() <= 0.03 * before[0, 0]:
             return None
         self._judged_by = self.matrix
         if before is None:
@@ -151,7 +150,8 @@ class Framing:
         # Only a hover leans by the wind alone.
         self._still_s = self._still_s + step_s if float(np.hypot(*velocity[:2])) < _STILL_M_S else 0.0
         if self._still_s > _SETTLED_S:
-            self._learned_s = min(self._learned_s + step_s, _LEARNING_S)
+            # The lean against wind is learned over 4 s: a gust passes, the wind stays.
+            self._learned_s = min(self._learned_s + step_s, 4.0)
             share = step_s / max(self._learned_s, 1e-3)
             self._wind = self._wind + share * (_GRAVITY * up[:2] / up[2] - self._wind)
 

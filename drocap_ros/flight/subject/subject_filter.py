@@ -18,7 +18,6 @@ from drocap_ros.stamps import NS
 
 STANDING_M_S = 0.3  # speed that the estimate of one who stands has
 WALKING_M_S = 0.5  # least speed of one who walks
-_DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are set down; no motion of the subject
 #: Memory of the ground by the body, and least images: several strides and a second; where the reported height wanders,
 #: a second, within which recorded ones change by 0.1 m, and half of one.
 _MEMORY, _WANDERING = (4 * NS, 15), (1 * NS, 8)
@@ -202,5 +201,6 @@ class SubjectFilter:
         # White acceleration of this standard deviation over a second, whatever the step.
         variance = self._config.subject_acceleration_m_s2**2 * np.array([1.0, 1.0, 0.1]) / max(dt, 1e-3)
         noise = push @ (variance[:, None] * push.T)
-        noise[:3, :3] += _DRIFT**2 * dt * _STAYS[:3, :3]
+        # The vehicle's position and the feet that are set down drift by 5 cm in a second: no motion of the subject.
+        noise[:3, :3] += 0.05**2 * dt * _STAYS[:3, :3]
         return move @ self._state, move @ self._covariance @ move.T + noise

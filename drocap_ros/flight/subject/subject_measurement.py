@@ -37,12 +37,10 @@ _ANKLES = np.array([BODY_15.index("rankle"), BODY_15.index("lankle")])
 _TRUNK = np.array([BODY_15.index(name) for name in ("pelvis", "rhip", "lhip", "neck")])
 _NECK = BODY_15.index("neck")
 _ANKLE_HEIGHT = 0.055  # share of the stature; a swinging foot lifts the mean a little
-_LOWEST = 0.1  # of the assumed height, at which a range by the ground still means something
 _PELVIS_HEIGHT = 0.53  # share of the stature (Winter), standing
 _CONFIDENCE = 0.25  # below it a joint counts as not seen
 _STEEP = np.sin(np.deg2rad(75.0))
 _SHALLOW = np.sin(np.deg2rad(4.0))
-_MAX_RANGE_M = 200.0  # a person is less than 10 px high there
 _THIRD_LONGEST = 0.99  # of the true length
 SIZE_NOISE = 0.06  # of one image, share of the range
 BENT = 4.0  # times the noise: a bent body looks smaller, as does a trunk that leans; its size counts for less
@@ -139,13 +137,15 @@ def locate_subject(
     ground, height, noise = _range_from_ground(rays, seen, camera.position, config)
     steady = size
     if np.isfinite(known.m) and np.isfinite(ground):  # the feet on the known ground
-        steady = ground * max(1.0 - (known.m - config.ground_height_m) / height, _LOWEST)
+        # Below a tenth of the assumed height a range by the ground means nothing.
+        steady = ground * max(1.0 - (known.m - config.ground_height_m) / height, 0.1)
     distance, sd = _fuse(steady, size_error, ground, _ground_sd(ground, height, config))
     if _contradict(steady, size_error, ground, height, config):
         # On another ground than assumed the ratio changes with the camera's height: the size of this image counts.
         steady = distance = size if np.isfinite(size) else steady
         sd, noise = 2 * size_error * distance, np.nan
-    if not 0.3 < distance < _MAX_RANGE_M:
+    # A person is less than 10 px high there.
+    if not 0.3 < distance < 200.0:
         return None
     nearer = 1.0 - float(np.fmin(steady, ground)) / distance
     ahead = np.array([pelvis[0], pelvis[1], 0.0]) / flat

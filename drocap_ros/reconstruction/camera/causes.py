@@ -22,8 +22,6 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 _LEAST_SHARE = 0.6
 #: Difference beyond configured slow errors, per unknown of a knot, below which nothing has to be explained.
 _ORDINARY = 1.0
-#: Standard deviations of a constant error from zero, from which a cause is sought at all.
-_CLEAR = 2.0
 #: Standard deviations by which a cause has to explain more than another one.
 _APART = 3.0
 #: Weight of an observation that fits, and the share of a frame's points with it, below which most lie elsewhere.
@@ -49,7 +47,8 @@ def single_causes(
 
     The points cannot distinguish the others from the first.  ``config`` : the expected errors
     """
-    if not (np.abs(found.shared) > _CLEAR * found.shared_std).any():
+    # A cause is sought from two standard deviations of a constant error from zero.
+    if not (np.abs(found.shared) > 2.0 * found.shared_std).any():
         return []
     path = CameraTelemetry(found.rotation, found.position, given.fps)
     data = PathInput(

@@ -21,7 +21,7 @@ from drocap_ros.reconstruction.camera.growth import (
     turns,
     with_ends,
 )
-from drocap_ros.reconstruction.camera.kinds import Sightings, kind_of, turning_focal
+from drocap_ros.reconstruction.camera.kinds import Sightings, kind_of, turning_focal, with_focal
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
 from drocap_ros.reconstruction.camera.path_model import FOCAL, Knots, PathConfig, PathInput, views_of
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
@@ -30,17 +30,11 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 #: Focal length of an unknown lens over the image's longer side, and the deviation of its logarithm: a factor of 1.4.
 FOCAL_SHARE: float = BundleAdjusterConfig.assumed_focal
 FOCAL_STD = 0.34
-#: Error of its logarithm that the posterior does not know, as errors of tracks last: orbits had 0.1 to 0.8 %.
-_LASTING_FOCAL_STD = 0.01
 #: Factors on it from which an unknown lens is sought.
 _FOCAL_STARTS = (0.7, 1.0, 1.5)
 #: Keyframes after which the starts are compared, and residuals over the least that are as good.
 _COMPARED = 16
-#: Share of points behind the camera from which a path counts as turned inside out: such ones had 5 to 54 %, others 0.
-_BEHIND = 0.03
 _AS_GOOD = 1.05
-#: The same of a whole path over those few keyframes: more points and times fit a little worse in any case.
-_WORSE = 1.5
 #: Parallax (rad) of the best pair below which a camera moves little, and tangents of the angle from the image's middle
 #: up to the horizon that are tried then: of cameras that look down by 15, 40 and 0 degrees.
 _LITTLE_PARALLAX = 0.02
@@ -103,8 +97,9 @@ def camera_from_points(
 def _moving(sightings: Sightings, camera: _Start, fps: float, key_hz: float) -> tuple[AdjustedPath | Kind, _Start]:
     """The path of a camera that moves, and its lens: grown from a pair, or all at once where it moves little."""
     every = _starts(sightings, camera, key_hz)
-    # Rays through a wrong lens can meet behind the camera as well: such a path is turned inside out.
-    starts = [start for start in every if start[1].behind < _BEHIND] or every
+    # Rays through a wrong lens can meet behind the camera as well: paths that are turned inside out so had 5 to 54 % of
+    # the points there, others 0.
+    starts = [start for start in every if start[1].behind < 0.03] or every
     if not starts:
         return Kind.NOTHING_FIXED, camera
     least = min(start.path.residual_px for _, start in starts)
@@ -116,7 +111,8 @@ def _moving(sightings: Sightings, camera: _Start, fps: float, key_hz: float) -> 
         start = next(start for _, start in starts if start.path.residual_px <= _AS_GOOD * least)
         grown, matrix = _grown(sightings, camera, start, fps)
         grown_px = grown.residual_px if isinstance(grown, AdjustedPath) else float("inf")
-        if small is None and starts[0][0] < ENOUGH_PARALLAX and grown_px > _WORSE * least:
+        # A path over more points and times than those few keyframes fits a little worse in any case.
+        if small is None and starts[0][0] < ENOUGH_PARALLAX and grown_px > 1.5 * least:
             small = _small_motion(sightings, camera, fps, _AS_GOOD * least)
         if small is None or grown_px <= small.residual_px:
             return grown, camera._replace(matrix=matrix)
@@ -174,9 +170,10 @@ def _with_facts(path: CameraPath, camera: _Start, found: AdjustedPath) -> Camera
     focal = float(np.exp(found.shared[FOCAL]))
     shape = None if found.posterior is None else found.posterior.shape
     steps = None if found.posterior is None else np.sqrt(np.diagonal(found.posterior.steps, axis1=1, axis2=2))
+    # Errors of tracks last, which the posterior does not know: focal lengths of orbits had 0.1 to 0.8 %.
     facts = PictureFacts(
         camera.kind if fits(found, camera.matrix) else Kind.NOTHING_FIXED,
-        focal_std=float(np.hypot(found.shared_std[FOCAL], _LASTING_FOCAL_STD)) if camera.focal_std else 0.0,
+        focal_std=float(np.hypot(found.shared_std[FOCAL], 0.01)) if camera.focal_std else 0.0,
         points=found.points,
         residual_px=found.residual_px,
         covered=found.covered,
@@ -197,8 +194,3 @@ def fits(found: AdjustedPath, matrix: np.ndarray) -> bool:
     """Whether a path explains the points that it was adjusted by."""
     near = found.residual_px < _LARGEST_PX * matrix[0, 2] * 2 / 1280.0
     return bool(near and np.mean(found.weight > 0.25) > _LEAST_FITTING)
-
-
-def with_focal(matrix: np.ndarray, factor: float) -> np.ndarray:
-    """The camera matrix (3, 3) with focal lengths so many times as long."""
-    return np.asarray(matrix * np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]]))

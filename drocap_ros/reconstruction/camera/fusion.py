@@ -20,6 +20,7 @@ from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjus
 from drocap_ros.reconstruction.camera.path_model import (
     ATTITUDE_LATENCY,
     KNOTS_HZ,
+    LEFT,
     MISALIGNMENT,
     POSITION_LATENCY,
     PathConfig,
@@ -34,31 +35,22 @@ from drocap_ros.reconstruction.world.even_capture import at_all_slots, capture_p
 from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, turned_at_once
 
-#: Slots of one adjustment: two minutes at 24 Hz, which bounds memory; and those that neighbours share, ten seconds:
-#: where GPS wanders, two windows differ by some decimetres.
-_WINDOW = 2880
+#: Slots that neighbouring windows share, ten seconds: where GPS wanders, two windows differ by some decimetres.
 _OVERLAP = 240
 #: Errors that the second adjustment expects of telemetry worse than configured: those of GPS and of a cheap gimbal.
-_WIDE_POSITION_M = 0.5
-_WIDE_ATTITUDE_DEG = 0.3
-_WIDE_TILT_DEG = 1.0
+_WIDE = CameraErrors(tilt_deg=1.0, position_wander_m=0.5, attitude_wander_deg=0.3)
 #: Time (s) over which the found errors tell how far they wander.
 _LAG_S = 4.0
 #: Found errors over the configured ones, from which the configuration does not hold.
 _OTHER = 1.5
 #: Share of the frames with enough points, below which the points do not tell the path.
 _LEAST_COVERED = 0.5
-#: Median residual (px per 1000 px of focal length) above which no camera's path explains the points.
-_LARGEST_RESIDUAL = 3.0
 #: Slow errors (degrees) of a reported turn above which it is another flight's: a gimbal's yaw that jumps by 9 degrees,
 #: the largest jump that is not refused as one, has 3; logs of other flights had 17 to 57.
 _LARGEST_TURN_DEG = 10.0
 #: Latency (s) from which the reports are shifted, and the largest share of it that its standard deviation may be.
 _LONG_S = 0.02
 _SURE = 0.2
-#: What the corrected path may still be off by, as a constant: nothing that a body could tell.
-_HELD_DEG = 0.02
-_HELD_S = 0.001
 
 
 class Fusion(NamedTuple):
@@ -96,7 +88,8 @@ def fuse_telemetry(
         # Points that contradict a part of a path lose their weight there: it would stay as reported.
         if refusal := frozen(turn[part], path[part], fps) or turned_at_once(turn[part], fps):
             return refusal
-        for inside in windows(part.stop - part.start, _WINDOW, _OVERLAP):
+        # Slots of one adjustment, two minutes at 24 Hz, bound memory.
+        for inside in windows(part.stop - part.start, 2880, _OVERLAP):
             rows = slice(part.start + inside.start, part.start + inside.stop)
             given = CameraTelemetry(turn[rows], path[rows], fps)
             found = _of_window(given, (slot, rows.start), camera, points, known)
@@ -151,7 +144,8 @@ def _of_window(
     found = _adjusted(PathInput(given, matrix, views, PathConfig(_errors(camera)), known))
     if not isinstance(found, AdjustedPath) or found.covered < _LEAST_COVERED:
         return found if isinstance(found, Refusal) else None
-    if found.residual_px > _LARGEST_RESIDUAL * 1e-3 * float(matrix[0, 0]):
+    # Above a median residual of 3 px per 1000 px of focal length no camera's path explains the points.
+    if found.residual_px > 3.0 * 1e-3 * float(matrix[0, 0]):
         return Refusal(Why.POINTS_MOVE_OTHERWISE, found.residual_px)
     return found
 
@@ -172,12 +166,12 @@ def _adjusted(data: PathInput) -> AdjustedPath | Refusal | None:
         0.5 * tilt_deg / own.tilt_deg,  # two standard deviations of a constant are no exception
     )
     if wide := max(over) >= _OTHER:
-        position_m = max(position_m, _WIDE_POSITION_M)
+        position_m = max(position_m, _WIDE.position_wander_m)
         own = replace(
             own,
-            tilt_deg=max(own.tilt_deg, _WIDE_TILT_DEG),
+            tilt_deg=max(own.tilt_deg, _WIDE.tilt_deg),
             position_wander_m=position_m,
-            attitude_wander_deg=max(attitude_deg, _WIDE_ATTITUDE_DEG),
+            attitude_wander_deg=max(attitude_deg, _WIDE.attitude_wander_deg),
         )
         # An error that wanders leaves the line between two knots.
         jitter_m = max(data.config.jitter_m, position_m * float(np.sqrt(0.5 / KNOTS_HZ / own.position_wander_s)))
@@ -262,9 +256,9 @@ def _left(errors: CameraErrors, steps: np.ndarray) -> CameraErrors:
     wander = np.sqrt(0.5 * errors.wander_s * steps)
     return replace(
         errors,
-        tilt_deg=_HELD_DEG,
-        yaw_deg=_HELD_DEG,
-        latency_s=_HELD_S,
+        tilt_deg=LEFT.tilt_deg,
+        yaw_deg=LEFT.yaw_deg,
+        latency_s=LEFT.latency_s,
         position_wander_m=float(np.sqrt(np.square(wander[:3]).mean())),
         attitude_wander_deg=float(np.degrees(np.sqrt(np.square(wander[3:]).mean()))),
     )

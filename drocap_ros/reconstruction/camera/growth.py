@@ -10,7 +10,7 @@ import numpy as np
 
 from drocap_ros.camera_path import CameraErrors
 from drocap_ros.geometry.rotations import exp_so3, log_so3
-from drocap_ros.reconstruction.camera.kinds import Sightings, rays, turn_between
+from drocap_ros.reconstruction.camera.kinds import Sightings, rays, turn_between, with_focal
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path, improved_path
 from drocap_ros.reconstruction.camera.path_model import FOCAL, PathConfig, PathInput, Views, triangulate
 from drocap_ros.reconstruction.camera.upright import largest_plane
@@ -75,8 +75,6 @@ _LEAST_COMMON = 16
 _PAIRS = 3
 #: Parallax (rad) above which more helps no pair, and from which a camera does not move little: six degrees.
 ENOUGH_PARALLAX = 0.1
-#: Percentile of the points' parallaxes that counts.
-_NEARER = 75
 
 
 class Pair(NamedTuple):
@@ -97,12 +95,12 @@ def candidate_pairs(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> 
             continue
         for first in np.unique(np.linspace(0, len(sightings) - 1 - lag, _PLACES).astype(int)).tolist():
             both = sightings.common(first, first + lag)
-            if len(both.piece) < _LEAST_COMMON:
+            if both.shape[1] < _LEAST_COMMON:
                 continue
-            _, angle = turn_between(rays(both.first, matrix), rays(both.second, matrix))
-            # Far points have no parallax: that of the nearer points counts.
-            parallax = float(np.percentile(angle, _NEARER))
-            score = min(parallax, ENOUGH_PARALLAX) * float(np.sqrt(len(both.piece)))
+            _, angle = turn_between(both, matrix)
+            # Far points have no parallax: the percentile is that of the nearer points.
+            parallax = float(np.percentile(angle, 75))
+            score = min(parallax, ENOUGH_PARALLAX) * float(np.sqrt(both.shape[1]))
             found.append(Pair(first, first + lag, parallax, score))
     found.sort(key=lambda pair: -pair.score)
     apart: list[Pair] = []
@@ -115,23 +113,16 @@ def candidate_pairs(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> 
 #: Distance (px) of a point from its epipolar line or its projection within which it supports a camera.
 _INLIER_PX = 2.0
 #: Steps of an adjustment while the path grows, and of the last one.
-_STEPS_WHILE_GROWING = 5
 LAST_STEPS = 12
 #: Keyframes after which the first adjustment runs, and their growth until the next one.
 _FIRST_KEYS = 12
 _GROWTH = 1.6
-#: Keyframes behind a gap that may be passed over while a camera sees too little.
-_GAP = 8
 #: Acceleration (heights of the camera per s^2) of a camera that moves little, and steps of its adjustment.
 _SMALL_ACCELERATION = 0.3
 _SMALL_STEPS = 25
-#: Parallax (rad) below which a point's depth is the noise's: 2 degrees, of tracks that err by 0.05.
-_LITTLE_PARALLAX = 0.035
 #: Angle (degrees) of the ground from the usual image's horizontal, and distance of its points over the camera's height.
 _TILTED_DEG = 60.0
 _FARTHEST_GROUND = 20.0
-#: Depth of a point over the camera's way beyond which it places no camera.
-_FARTHEST = 200.0
 
 
 @dataclass(frozen=True)
@@ -152,8 +143,7 @@ def begin(sightings: Sightings, pair: Pair, matrix: np.ndarray) -> Grown | None:
     """The path at a pair of keyframes, one unit of length apart, by the essential matrix; None = too few points fit."""
     import cv2
 
-    both = sightings.common(pair.first, pair.second)
-    plane = [np.ascontiguousarray(rays(points, matrix)) for points in (both.first, both.second)]
+    plane = [np.ascontiguousarray(rays(points, matrix)) for points in sightings.common(pair.first, pair.second)]
     first, second = (direction[:, :2] / direction[:, 2:] for direction in plane)
     within = _INLIER_PX / float(matrix[0, 0])
     essential, inside = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, within, 1000)
@@ -199,7 +189,8 @@ class Growth:
     @property
     def _flat(self) -> np.ndarray:
         """(J,) points whose rays show no depth."""
-        return np.asarray(np.linalg.norm(self._ray - self._first, axis=1) < _LITTLE_PARALLAX)
+        # Below 2 degrees (rad) a point's depth is the noise's, of tracks that err by 0.05.
+        return np.asarray(np.linalg.norm(self._ray - self._first, axis=1) < 0.035)
 
     def _ways(self) -> tuple[Callable[[], bool], Callable[[], bool]]:
         """Ways to place the next keyframes, the better one first.
@@ -221,7 +212,8 @@ class Growth:
         ground = largest_plane(self.places[self.usable & ~flat], self.path.position[known], up, _TILTED_DEG)
         if ground is None:
             return False
-        height, falls = self._eye @ ground.up - ground.level, -self._ray @ ground.up
+        normal, level = ground
+        height, falls = self._eye @ normal - level, -self._ray @ normal
         lying = (self._count > 0) & flat & (height > 0.0) & (falls > 1.0 / _FARTHEST_GROUND)
         away = (height[lying] / falls[lying])[:, None]
         # Rays from one place meet there: other points without depth would hold the camera fast.
@@ -235,7 +227,8 @@ class Growth:
         inside = [key for key in range(low, high) if not self.path.known[key]]
         if len(known) == 2 and inside:
             return inside
-        for gap in range(1, _GAP + 1):
+        # Keyframes behind a gap may be passed over while a camera sees too little.
+        for gap in range(1, 8 + 1):
             keys = [key for key in (low - gap, high + gap) if 0 <= key < len(self.sightings)]
             if any(self._matches(key)[0].sum() >= LEAST_POINTS for key in keys):
                 return keys
@@ -266,10 +259,8 @@ class Growth:
         near = int(known[np.argmin(np.abs(known - key))])
         both = self.sightings.common(near, key)
         rotation = self.path.rotation[near]
-        if len(both.piece) >= LEAST_POINTS:
-            rotation = (
-                turn_between(rays(both.first, self.path.matrix), rays(both.second, self.path.matrix))[0] @ rotation
-            )
+        if both.shape[1] >= LEAST_POINTS:
+            rotation = turn_between(both, self.path.matrix)[0] @ rotation
         other = 2 * near - key
         steady = 0 <= other < len(self.path.known) and bool(self.path.known[other])
         step = self.path.position[near] - self.path.position[other] if steady else 0.0
@@ -310,7 +301,8 @@ class Growth:
         # The least square is that of a good point's residuals; the next one tells how well its depth is known.
         noise = np.square(_INLIER_PX / self.path.matrix[0, 0]) * np.square(np.linalg.norm(point, axis=1))
         agree = value[:, 0] < self._count[piece] * np.maximum(noise * np.square(way), 1e-30) * 100.0
-        near = np.linalg.norm(self.places[piece], axis=1) < _FARTHEST * way
+        # A point this much farther than the camera's way places no camera.
+        near = np.linalg.norm(self.places[piece], axis=1) < 200.0 * way
         deep = value[:, 1] > 30.0 * np.maximum(value[:, 0], 1e-30)
         sure = (self._count[piece] >= 2) & agree & near & deep
         before = np.einsum("ni,ni->n", self.places[piece] - self._eye[piece], self._ray[piece]) > 0.0
@@ -328,11 +320,11 @@ class Growth:
         data = _problem(self.sightings.at_keys, keys, self.path, self.key_hz, self.focal_std)
         if data is None:
             return
-        found, _, _ = improved_path(replace(data, config=replace(data.config, iterations=_STEPS_WHILE_GROWING)))
+        # Few steps will do while the path grows.
+        found, _, _ = improved_path(replace(data, config=replace(data.config, iterations=5)))
         rotation, position = self.path.rotation.copy(), self.path.position.copy()
         rotation[known], position[known] = found.rotation[known - known[0]], found.position[known - known[0]]
-        focal = float(np.exp(found.state.shared[FOCAL]))
-        matrix = self.path.matrix * np.array([[focal, 1.0, 1.0], [1.0, focal, 1.0], [1.0, 1.0, 1.0]])
+        matrix = with_focal(self.path.matrix, float(np.exp(found.state.shared[FOCAL])))
         # The way is the unit: what an adjustment shrinks grows back.
         scale = max(float(np.linalg.norm(np.ptp(position[known], axis=0))), 1e-9)
         residual_px = float(np.median(np.linalg.norm(found.image, axis=1)))
@@ -358,9 +350,7 @@ def with_ends(sightings: Sightings, path: Grown) -> Grown:
 def _turned(sightings: Sightings, first: int, second: int, matrix: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) from one keyframe to another by their common points; none where there are too few."""
     both = sightings.common(first, second)
-    if len(both.piece) < 3:
-        return np.eye(3)
-    return turn_between(rays(both.first, matrix), rays(both.second, matrix))[0]
+    return np.eye(3) if both.shape[1] < 3 else turn_between(both, matrix)[0]
 
 
 def turns(sightings: Sightings, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,14 +17,6 @@ from drocap_ros.tracks import Tracks
 #: Steps of reweighting of a turn, and the least scale (rad) of its residuals: a tenth of a pixel.
 _TURN_STEPS = 8
 _LEAST_ANGLE = 1e-4
-
-
-class Common(NamedTuple):
-    """What two keyframes both see: piece (N,), and where, (N, 2) px each."""
-
-    piece: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
 
 
 class Sightings:
@@ -53,11 +44,16 @@ class Sightings:
         rows = self.rows[key]
         return self.views.piece[rows], self.views.point[rows]
 
-    def common(self, first: int, second: int) -> Common:
-        """What both keyframes see."""
+    def common(self, first: int, second: int) -> np.ndarray:
+        """(2, N, 2) px, where two keyframes see what both see."""
         (a, at_a), (b, at_b) = self.at(first), self.at(second)
-        both, in_a, in_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
-        return Common(both, at_a[in_a], at_b[in_b])
+        _, in_a, in_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
+        return np.stack([at_a[in_a], at_b[in_b]])
+
+
+def with_focal(matrix: np.ndarray, factor: float) -> np.ndarray:
+    """The camera matrix (3, 3) with focal lengths so many times as long."""
+    return np.asarray(matrix * np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]]))
 
 
 def rays(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -67,9 +63,9 @@ def rays(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
-def turn_between(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) that best maps directions (N, 3) to others, robust, and the angles (N,) rad that remain."""
-    weight = np.ones(len(first))
+def turn_between(both: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) of a camera between two views (2, N, 2) px, robust, and the angles (N,) rad that it leaves."""
+    (first, second), weight = (rays(points, matrix) for points in both), np.ones(both.shape[1])
     for _ in range(_TURN_STEPS):
         rotation = project_to_so3((weight[:, None] * second).T @ first)
         angle = np.linalg.norm(second - first @ rotation.T, axis=1)
@@ -81,15 +77,11 @@ def turn_between(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.
 _LEAST_POINTS = 12
 #: Share of the points that goes on over a cut, at most: some corners of the new image look like those of the old one.
 _GOES_ON = 0.05
-#: Longest time (s) without points that counts as a cut: a fade; later no point could go on anyway.
-_FADE_S = 0.5
 #: Logarithm of the factor by which an image grows or shrinks at once where a cut leads to a nearer or farther view of
 #: the same scene, and how many times that between the images beside: clips of drones and hands, with 5 to 60 images a
 #: second, have up to 0.04, and that steadily.
 _GROWS = 0.05
 _AT_ONCE = 4.0
-#: Distance (px) of points from their middle below which they tell no growth: errors of tracks are as large.
-_SAME_SIZE_PX = 1.0
 
 
 def cut_times(tracks: Tracks) -> list[float]:
@@ -112,10 +104,11 @@ def cuts(points: Background, time_s: np.ndarray) -> list[int]:
     growth = np.array([0.0, *(grown for _, grown in compared), 0.0])
     beside = np.maximum(growth[:-2], growth[2:])
     jumps = growth[1:-1] > np.maximum(_GROWS, _AT_ONCE * beside)
+    # Longest time (s) without points that counts as a cut: a fade; later no point could go on anyway.
     return [
         before + 1
         for (before, after), (share, _), jump in zip(pairs, compared, jumps, strict=True)
-        if (share < _GOES_ON or jump) and time_s[after] - time_s[before] <= _FADE_S
+        if (share < _GOES_ON or jump) and time_s[after] - time_s[before] <= 0.5
     ]
 
 
@@ -125,8 +118,9 @@ def _compared(points: Background, before: np.ndarray, after: np.ndarray) -> tupl
     share = len(common) / min(len(before), len(after))
     if len(common) < _LEAST_POINTS:
         return share, 0.0
+    # Nearer to their middle points tell no growth: errors of tracks are as large.
     first, second = (
-        np.maximum(np.linalg.norm(seen - np.median(seen, axis=0), axis=1), _SAME_SIZE_PX)
+        np.maximum(np.linalg.norm(seen - np.median(seen, axis=0), axis=1), 1.0)
         for seen in (points.point[rows[place]] for rows, place in zip((before, after), places, strict=True))
     )
     return share, float(np.abs(np.median(np.log(second / first))))
@@ -146,8 +140,6 @@ _ZOOM = 0.01
 _ZOOM_STEPS = 6
 #: Factors on the focal length that are tried for a camera that turns: least, largest, how many.
 _FOCALS = (0.5, 2.0, 9)
-#: What a turn leaves of the points' way where it explains it.
-_EXPLAINED = 0.5
 #: Share of pairs that have to agree.
 _MOST = 0.8
 #: Share of keyframes that see enough points, at least.
@@ -164,13 +156,13 @@ def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int)
         return Kind.FEW_POINTS
     same = _SAME_PX * width / _REFERENCE_WIDTH
     # First, as turns and zooms take nearly all of the time: a camera on a tripod is asked in each live window.
-    way = np.array([np.median(np.linalg.norm(both.second - both.first, axis=1)) for both in pairs])
+    way = np.array([np.median(np.linalg.norm(there - here, axis=1)) for here, there in pairs])
     if np.mean(way < same) >= _MOST and np.mean(way < 2 * same) >= 0.5 * (1.0 + _MOST):
         return Kind.STANDS
     turned, zoomed, zoom = _motion(pairs, matrix)
     if np.mean(turned < same) >= _MOST:
         # What no turn explains either is the tracks' errors: of small images, or behind persons who pass.
-        explains = turned[way >= same] < _EXPLAINED * way[way >= same]
+        explains = turned[way >= same] < 0.5 * way[way >= same]
         return Kind.TURNS if explains.mean() > 0.5 else Kind.STANDS
     zooms = (zoomed < same) & (np.abs(zoom) > _ZOOM)
     if zooms.any() and np.mean(zoomed < same) >= _MOST:
@@ -195,20 +187,18 @@ def cut_at(sightings: Sightings, over_gaps: bool = False) -> int | None:
 def turning_focal(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> float:
     """Factor on the focal length at which turns explain the points best; for a camera that turns in its place."""
     factors = np.geomspace(*_FOCALS)
-    rest, pairs = [], _pairs(sightings, key_hz)
-    for factor in factors:
-        other = matrix * np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]])
-        rest.append(float(np.median(_motion(pairs, other)[0])))
+    pairs = _pairs(sightings, key_hz)
+    rest = [float(np.median(_motion(pairs, with_focal(matrix, factor))[0])) for factor in factors]
     return float(factors[int(np.argmin(rest))])
 
 
-def _motion(pairs: list[Common], matrix: np.ndarray) -> np.ndarray:
+def _motion(pairs: list[np.ndarray], matrix: np.ndarray) -> np.ndarray:
     """(3, N) of pairs: what a turn leaves of the points' way (px), what turn and zoom leave (px), zoom."""
     return np.array([_compare(both, matrix) for both in pairs]).reshape(-1, 3).T
 
 
-def _pairs(sightings: Sightings, key_hz: float) -> list[Common]:
-    """Points that pairs of keyframes have in common."""
+def _pairs(sightings: Sightings, key_hz: float) -> list[np.ndarray]:
+    """Points (2, N, 2) px that pairs of keyframes have in common."""
     found = []
     for lag_s in _LAGS_S:
         lag = max(round(lag_s * key_hz), 1)
@@ -217,15 +207,16 @@ def _pairs(sightings: Sightings, key_hz: float) -> list[Common]:
             continue
         for first in np.unique(np.linspace(0, last, _PAIRS).astype(int)).tolist():
             both = sightings.common(first, first + lag)
-            if len(both.piece) >= _LEAST_COMMON:
+            if both.shape[1] >= _LEAST_COMMON:
                 found.append(both)
     return found
 
 
-def _compare(both: Common, matrix: np.ndarray) -> tuple[float, float, float]:
-    focal, first = float(matrix[0, 0]), rays(both.first, matrix)
-    rotation, angle = turn_between(first, rays(both.second, matrix))
-    zoom, zoomed = _turn_and_zoom(first @ rotation.T, (both.second - matrix[:2, 2]) / np.diagonal(matrix)[:2])
+def _compare(both: np.ndarray, matrix: np.ndarray) -> tuple[float, float, float]:
+    focal, (first, second) = float(matrix[0, 0]), both
+    rotation, angle = turn_between(both, matrix)
+    plane = (second - matrix[:2, 2]) / np.diagonal(matrix)[:2]
+    zoom, zoomed = _turn_and_zoom(rays(first, matrix) @ rotation.T, plane)
     return focal * float(np.median(angle)), focal * zoomed, float(np.log(max(zoom, 1e-3)))
 
 

@@ -30,11 +30,6 @@ from drocap_ros.reconstruction.common.engine import Covariances, Equations
 from drocap_ros.reconstruction.common.poses import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.world_model import Findings
 
-#: Knots of which the deviations after the best similarity are computed: each costs six columns of the inverse.
-_NODES = 24
-#: Half of the squared lengths of pairs with a standard deviation of 1 are below it.
-_MEDIAN_SQUARE = 1.39
-
 
 class Posterior(NamedTuple):
     """Covariances of K knots, position (m) and rotation (rad, camera axes).
@@ -84,7 +79,8 @@ def posterior_of(r: PathResiduals) -> Posterior | None:
 def _shape(r: PathResiduals, found: Covariances, total: np.ndarray) -> np.ndarray:
     """(K, 2) standard deviations of position and rotation of the knots after the best similarity, by some of them."""
     frame = r.data.knots.frame
-    some = np.unique(np.round(np.linspace(0, len(frame) - 1, _NODES)).astype(np.intp))
+    # Some knots will do: each costs six columns of the inverse.
+    some = np.unique(np.round(np.linspace(0, len(frame) - 1, 24)).astype(np.intp))
     columns = KNOT * len(some)
     covariance = np.empty((columns, columns))
     for column, node in enumerate(some.tolist()):  # one by one: an hour has a wide inverse
@@ -111,7 +107,8 @@ def _shape(r: PathResiduals, found: Covariances, total: np.ndarray) -> np.ndarra
 
 def with_own_noise(r: PathResiduals) -> PathResiduals:
     """Residuals at the same point and robust weights, with the noise that they show: the priors keep their sizes."""
-    noise = max(float(np.median(r.square)) / _MEDIAN_SQUARE, 1e-12)
+    # Half of the squared lengths of pairs with a standard deviation of 1 are below 1.39.
+    noise = max(float(np.median(r.square)) / 1.39, 1e-12)
     config = replace(r.data.config, noise_px=r.data.config.noise_px * float(np.sqrt(noise)))
     return PathResiduals(replace(r.data, config=config), r.weights, r.state, r.outlier / noise)
 
@@ -129,8 +126,6 @@ def _by_shared(r: PathResiduals) -> np.ndarray:
 
 #: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 5e-4
-#: The same of the first steps: after them the errors' wander changes by a twentieth at most.
-_ROUGH = 0.02
 #: Damping of the first step, as a share of the diagonal, and the least one after a step that raises the cost.
 _FIRST_DAMPING = 1e-3
 _LEAST_DAMPING = 1e-6
@@ -140,8 +135,6 @@ _NEARNESS = (0.03, 2.0)
 _HORIZON = 0.26
 #: Most dampings that are tried for one step.
 _TRIALS = 8
-#: Steps of the rest of each frame, with the points held: with one, a body's scale errs by 0.3 % more.
-_REST_STEPS = 2
 #: Points in a frame below which its camera is the neighbours' alone.
 ENOUGH_POINTS = 8
 
@@ -220,7 +213,8 @@ def adjust_path(data: PathInput, start: PathState | None = None, horizon: float 
 def rough_path(data: PathInput) -> PathState | None:
     """The first steps of :func:`adjust_path`: how far the errors wander; None = no track is long enough."""
     views, _ = _at_knots(data)
-    return improved_path(replace(data, views=views), falls=_ROUGH)[0].state if len(views.frame) else None
+    # After steps that lower the cost by less, the errors' wander changes by a twentieth at most.
+    return improved_path(replace(data, views=views), falls=0.02)[0].state if len(views.frame) else None
 
 
 def _at_knots(data: PathInput) -> tuple[Views, np.ndarray]:
@@ -264,7 +258,7 @@ def _improved(here: PathResiduals, damping: float) -> tuple[PathResiduals | None
     for _ in range(_TRIALS):
         step = equations.step(damping)
         if step is not None:
-            there = with_points(here.moved(step.errors, step.shared, step.points))
+            there = with_points(here.moved(*step))
             if there.cost <= here.cost:
                 return there, 0.1 * damping
         damping = 10.0 * max(damping, _LEAST_DAMPING)
@@ -285,7 +279,8 @@ def with_rest(r: PathResiduals) -> PathResiduals:
     """Residuals after the rest of each frame has been found, with the points where they are."""
     data, config = r.data, r.data.config
     expected = np.repeat([config.jitter_m, np.deg2rad(config.jitter_deg)], 3) ** -2.0
-    for _ in range(_REST_STEPS):
+    # With one step instead of two, a body's scale errs by 0.3 % more.
+    for _ in range(2):
         by_view = data.views.of_frames(np.concatenate([r.by_errors, r.weighted[..., None]], axis=2))
         rows = by_view.reshape(data.path.frames, -1, KNOT + 1)
         own = np.swapaxes(rows, 1, 2) @ rows

@@ -124,6 +124,9 @@ FOCAL = 5
 SHARED = 6
 #: Couplings of the acceleration: two knots on.
 LEAST_REACH = 3
+#: Errors that a path by fixed points may still have: constant ones that no body could tell, as the points turn with the
+#: camera, and the least slow one.
+LEFT = CameraErrors(tilt_deg=0.02, yaw_deg=0.02, latency_s=1e-3, attitude_wander_deg=0.05)
 #: Knots per second: between them a camera that accelerates with 3 m/s^2 leaves a straight line by 6 mm.
 KNOTS_HZ = 8.0
 

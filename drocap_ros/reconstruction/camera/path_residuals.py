@@ -264,14 +264,6 @@ def knots_of_frames(r: PathResiduals, values: np.ndarray) -> np.ndarray:
 POINT_WEIGHT = 10.0
 
 
-class Step(NamedTuple):
-    """Changes of the knots (K, 6), the shared unknowns (SHARED,) and the points (J, 3)."""
-
-    errors: np.ndarray
-    shared: np.ndarray
-    points: np.ndarray
-
-
 class PathEquations:
     """The reduced equations at one point.
 
@@ -364,8 +356,11 @@ class PathEquations:
         used = self._gradient[0].size
         self.band, self.border, self.right = self.band[:used], self.border[:used], self.right[:used]
 
-    def step(self, damping: float = 0.0) -> Step | None:
-        """The step; ``damping`` shortens it, a share of the knots' mean diagonal; None = not positive definite."""
+    def step(self, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Changes of the knots (K, 6), the shared unknowns (SHARED,) and the points (J, 3); None = not definite.
+
+        damping : shortens the step, a share of the knots' mean diagonal
+        """
         band = self.band.copy()
         # The mean over the axes does not depend on where north is.
         band[:, 0] += damping * np.repeat(band[:, 0].reshape(-1, 3).mean(axis=1), 3)
@@ -380,5 +375,4 @@ class PathEquations:
             self._points + np.einsum("jik,jk->ji", self._knots, near) + self._shared @ shared[self._free]
         )
         points = -np.einsum("jki,jk->ji", self._inverse, inside)
-        errors = knots.reshape(-1, KNOT)
-        return Step(errors, shared, points)
+        return knots.reshape(-1, KNOT), shared, points

@@ -11,7 +11,7 @@ from drocap_ros.camera_path import CameraErrors, CameraPath, Kind, PictureFacts,
 from drocap_ros.contacts import ANKLE_M, ANKLES
 from drocap_ros.geometry.rotations import centred_camera, pack_covariance
 from drocap_ros.reconstruction.camera.from_picture import FOCAL_SHARE, camera_from_points
-from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ
+from drocap_ros.reconstruction.camera.path_model import KNOTS_HZ, LEFT
 from drocap_ros.reconstruction.camera.upright import set_upright
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.windows import even_slots
@@ -21,16 +21,8 @@ from drocap_ros.reconstruction.world.placement import place_in_world, smooth_ove
 from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.reconstruction.world.world_model import GROUND_M, SIZE_STD
 
-#: Errors of a path from fixed points, per track of which a hundred remain: constant ones have no place in it, as the
-#: points turn with the camera; slow ones (`HELD_M`, `_ATTITUDE_DEG`) are at least these.
-_TURNED_DEG = 0.02
-_LATENCY_S = 1e-3
+#: Least slow error (m) of the place of a path from fixed points, per track of which a hundred remain.
 HELD_M = 0.02
-#: Least deviation (deg) of an attitude that is told: a person reads it off a tripod, or a phone.
-_TOLD_DEG = 1.0
-_ATTITUDE_DEG = 0.05
-#: Time (s) over which feet that stand and swing are one height.
-_STRIDE_S = 0.5
 #: Largest standard deviation of the logarithm of a path's scale, before body and camera are adjusted together.
 _SCALE_STD = 0.3
 
@@ -62,7 +54,8 @@ def with_told(found: CameraPath, attitude: np.ndarray, errors: CameraErrors | No
     assert found.rotation is not None
     assert found.picture is not None
     up = np.einsum("fji,fj->i", found.rotation, attitude[:, :, 2])
-    std_deg = max((errors or CameraErrors()).tilt_deg, _TOLD_DEG)
+    # An attitude that is told is known to a degree at best: a person reads it off a tripod, or a phone.
+    std_deg = max((errors or CameraErrors()).tilt_deg, 1.0)
     picture = replace(found.picture, told=up / np.linalg.norm(up), told_std_deg=std_deg)
     return replace(found, picture=picture)
 
@@ -101,8 +94,7 @@ def with_camera(camera: CameraPath, poses: ImagePoses, per_px: np.ndarray) -> Ca
     # What feet have measured the adjustment measures better, from the same feet: no prior counts them twice.
     scale_std = _SCALE_STD if facts.feet_tell else min(facts.scale_std, _SCALE_STD)
     # Steps of the path err independently and add up to an error that wanders: resting feet and the body's size tell it.
-    tilt_deg = max(facts.up_std_deg, _TURNED_DEG)
-    errors = CameraErrors(tilt_deg, _TURNED_DEG, _LATENCY_S, attitude_wander_deg=_ATTITUDE_DEG)
+    errors = replace(LEFT, tilt_deg=max(facts.up_std_deg, LEFT.tilt_deg))
     step_m = float(np.nan_to_num(metres_per_unit(camera, position) * raw.position_std))
     wander_m = step_m * float(np.sqrt(0.5 * KNOTS_HZ * errors.position_wander_s))
     errors = replace(errors, position_wander_m=max(HELD_M, wander_m))
@@ -146,7 +138,8 @@ def on_ground(camera: CameraPath, poses: ImagePoses, per_px: np.ndarray) -> np.n
     fits = (lower < -ANKLE_M) & np.isfinite(lower)
     off = np.log(np.where(fits, above / np.maximum(ANKLE_M - lower, GROUND_M), 1.0))
     share = SIZE_STD**2 / (SIZE_STD**2 + np.square(GROUND_M / above))
-    nearer = share * smooth_over_time(off, camera.stamp_ns, _STRIDE_S)
+    # Within half a second feet that stand and swing are one height.
+    nearer = share * smooth_over_time(off, camera.stamp_ns, 0.5)
     return np.asarray(per_px * np.exp(nearer - np.median(nearer)))  # the body keeps its size: metres are the path's
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from drocap_ros.camera_path import CameraPath, UpSource
 from drocap_ros.contacts import ANKLE_M, ANKLES, rest_likelihood
-from drocap_ros.reconstruction.world.placement import estimate_scale
+from drocap_ros.reconstruction.world.placement import ScaleEstimate, estimate_scale
 from drocap_ros.reconstruction.world.world_model import SIZE_STD
 from drocap_ros.skeleton import BODY_17
 
@@ -26,15 +26,12 @@ LEAST_ON_PLANE = 20
 LEAST_SHARE = 0.15
 
 
-class GroundPlane(NamedTuple):
-    """Points x with ``up @ x == level``; up (3,) of length 1, on the camera's side."""
-
-    up: np.ndarray
-    level: float
-
-
-def largest_plane(places: np.ndarray, position: np.ndarray, up: np.ndarray, within_deg: float) -> GroundPlane | None:
+def largest_plane(
+    places: np.ndarray, position: np.ndarray, up: np.ndarray, within_deg: float
+) -> tuple[np.ndarray, float] | None:
     """The plane below a path (K, 3) on which most of the points (N, 3) lie; None = there is none.
+
+    It is of points x with ``normal @ x == level``; its normal (3,) of length 1 is on the path's side.
 
     up : (3,) about across it, to ``within_deg``
     """
@@ -55,7 +52,7 @@ def largest_plane(places: np.ndarray, position: np.ndarray, up: np.ndarray, with
     best = int(on.argmax())
     if on[best] < max(LEAST_ON_PLANE, LEAST_SHARE * len(places)):
         return None
-    return GroundPlane(normal[best], float(level[best]))
+    return normal[best], float(level[best])
 
 
 _PELVIS, _NECK = BODY_17.index("pelvis"), BODY_17.index("neck")
@@ -64,18 +61,12 @@ _OCTAVES = 6
 #: Share of feet that rest below which contacts give no scale, and its errors over its formal deviation.
 _LEAST_SUPPORT = 0.1
 _CONTACT_STDS = 3.0
-#: Deviation of the logarithm of a scale that is guessed: a factor of two.
-_GUESS_STD = 0.7
 #: Deviation of the scale below which contacts measure it.
 FEET_TELL = 0.05
-#: Standard deviation (degrees) of a plane through three points.
-_LEVEL_STD_DEG = 3.0
 #: Standard deviation (degrees) of the body's mean direction from the vertical: people lean, and the lifter does.
 _BODY_STD_DEG = 3.0
 #: Standard deviation (degrees) of a wall's edge, or a door's, that is marked by two clicks.
 _LINE_STD_DEG = 1.0
-#: Angle (degrees) from the mean at which one frame's direction has half its weight.
-_LEANS_DEG = 15.0
 #: Standard deviation (m) of a resting foot's height, and independent ones per second: a foot rests for half a second.
 _FOOT_STD_M = 0.15
 #: Size (m) of a place: a foot's length.
@@ -89,26 +80,17 @@ _REST_S = 0.25
 _REST_M = 0.05
 #: Steps of reweighting.
 _STEPS = 10
-#: Least standard deviation (degrees) of up: ground is no water level.
-_LEAST_STD_DEG = 0.5
-
-
-class PathScale(NamedTuple):
-    """Metres per unit of a path, and the standard deviation of its logarithm."""
-
-    factor: float
-    std: float
 
 
 class Level(NamedTuple):
-    """Ground in the unit of a path: up (3,), height along it, and the scale at which feet stand on it.
+    """Ground in the unit of a path: up (3,), height along it, and the metres per unit at which feet stand on it.
 
     spread : standard deviation of the logarithm of one frame's scale
     """
 
     up: np.ndarray
     height: float
-    scale: PathScale
+    scale: ScaleEstimate
     spread: float
 
 
@@ -143,9 +125,8 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
         contacts = by_contacts(feet, position, stamp_ns)
         feet_tell = contacts is not None and contacts.std < FEET_TELL
         found = [None if level is None else level.scale, contacts]
-        factor, factor_std = _together(
-            [scale for scale in found if scale is not None] or [_guess(feet, position, points)]
-        )
+        scale = _together([scale for scale in found if scale is not None] or [_guess(feet, position, points)])
+        factor, factor_std = scale.factor, scale.std
     path, lying = factor * position, points * np.array([factor] * 3 + [1.0])
     feet = path[:, None] + feet
     by_feet = _by_feet(plane, feet, stamp_ns)
@@ -154,7 +135,8 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
         source = UpSource.FEET
     plane = by_feet
     if level is not None and source is not UpSource.TOLD:
-        begun = _Plane(level.up, factor * level.height + ANKLE_M, np.deg2rad(_LEVEL_STD_DEG) ** 2 * np.eye(2))
+        # A plane through three points is known to 3 degrees.
+        begun = _Plane(level.up, factor * level.height + ANKLE_M, np.deg2rad(3.0) ** 2 * np.eye(2))
         begun = _by_lines(begun, facts.lines)
         plane, source = _by_points(begun, feet, lying) or begun, UpSource.GROUND
     turn = _axes(plane.up, rotation[0])
@@ -162,28 +144,30 @@ def set_upright(camera: CameraPath, seen: np.ndarray) -> CameraPath:
     origin = middle + (plane.height - middle @ plane.up - ANKLE_M) * plane.up
     moved = lying.copy()
     moved[:, :3] = (lying[:, :3] - lying[:, 3:] * origin) @ turn.T
-    std = max(np.degrees(np.sqrt(0.5 * np.trace(plane.covariance))), _LEAST_STD_DEG)
+    # Ground is no water level: it is known to half a degree at best.
+    std = max(np.degrees(np.sqrt(0.5 * np.trace(plane.covariance))), 0.5)
     facts = replace(facts, points=moved, up=source, up_std_deg=float(std), scale_std=factor_std, feet_tell=feet_tell)
     return replace(camera, rotation=rotation @ turn.T, position=(path - origin) @ turn.T, picture=facts)
 
 
-def _together(found: list[PathScale]) -> PathScale:
-    """Scales as one, by their deviations."""
+def _together(found: list[ScaleEstimate]) -> ScaleEstimate:
+    """Scales, of metres per unit of a path, as one, by their deviations."""
     weight = np.array([scale.std**-2 for scale in found])
     log = np.log([scale.factor for scale in found])
     std = max(float(weight.sum() ** -0.5), SIZE_STD)
-    return PathScale(float(np.exp(weight @ log / weight.sum())), std)
+    return ScaleEstimate(float(np.exp(weight @ log / weight.sum())), std)
 
 
-def _guess(feet: np.ndarray, position: np.ndarray, points: np.ndarray) -> PathScale:
+def _guess(feet: np.ndarray, position: np.ndarray, points: np.ndarray) -> ScaleEstimate:
     """The scale at which points (J, 4) are about as far as feet (F, 2, 3) m from the camera (F, 3): over water, say."""
     near = np.abs(points[:, 3]) > 1e-9
     away = np.linalg.norm(points[near, :3] / points[near, 3:] - position.mean(axis=0), axis=1)
     factor = float(np.median(np.linalg.norm(feet, axis=-1))) / float(np.median(away)) if near.any() else 1.0
-    return PathScale(factor, _GUESS_STD)
+    # The logarithm of a guess deviates by a factor of two.
+    return ScaleEstimate(factor, 0.7)
 
 
-def by_contacts(feet: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) -> PathScale | None:
+def by_contacts(feet: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) -> ScaleEstimate | None:
     """The scale of a path (F, 3) at which feet (F, 2, 3) m from the camera rest; None = it moves too little."""
     way = float(np.linalg.norm(np.ptp(position, axis=0)))
     # A camera's way is about as long as its distance from the person.
@@ -193,7 +177,7 @@ def by_contacts(feet: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) ->
         unit = guess * 2.0**octave
         found = estimate_scale(feet, unit * position, stamp_ns)
         if found is not None and found.support > support:
-            best, support = PathScale(unit / found.factor, _CONTACT_STDS * found.std), found.support
+            best, support = replace(found, factor=unit / found.factor, std=_CONTACT_STDS * found.std), found.support
     return best
 
 
@@ -207,17 +191,18 @@ def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np
     plane = largest_plane(places, position, up, 3.0 * _BODY_STD_DEG)
     if plane is None:
         return None
+    normal, height = plane
     # The lower foot of a frame stands, mostly; its ankle is a little above the ground.
-    down = -(feet @ plane.up)
-    above = position @ plane.up - plane.level
+    down = -(feet @ normal)
+    above = position @ normal - height
     standing = down.max(axis=1) + ANKLE_M
     fits = (standing > 0.0) & (above > 0.0)
     if fits.mean() < 0.5:
         return None
     log = np.log(standing[fits] / above[fits])
     spread = 1.48 * float(np.median(np.abs(log - np.median(log))))
-    scale = PathScale(float(np.exp(np.median(log))), max(SIZE_STD, 0.5 * spread))
-    return Level(plane.up, plane.level, scale, spread)
+    scale = ScaleEstimate(float(np.exp(np.median(log))), max(SIZE_STD, 0.5 * spread))
+    return Level(normal, height, scale, spread)
 
 
 def body_up(joints: np.ndarray) -> tuple[np.ndarray, float]:
@@ -228,7 +213,8 @@ def body_up(joints: np.ndarray) -> tuple[np.ndarray, float]:
     up = _unit(each.sum(axis=0))
     for _ in range(_STEPS):
         off = np.degrees(np.arccos(np.clip(each @ up, -1.0, 1.0)))
-        weight = 1.0 / (1.0 + np.square(off / _LEANS_DEG)) ** 2
+        # A direction 15 degrees from the mean has a quarter of its weight.
+        weight = 1.0 / (1.0 + np.square(off / 15.0)) ** 2
         up = _unit(weight @ each)
     return up, max(_BODY_STD_DEG, 0.3 * float(np.median(off)))
 

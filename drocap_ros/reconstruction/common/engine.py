@@ -151,17 +151,22 @@ class Equations(NamedTuple):
         return backward(factor, y[:, :1] - y[:, 1:] @ step[:, None]).reshape(frames.shape), step
 
 
-class Point(Protocol):
-    """One point of a problem."""
+class Costed(Protocol):
+    """What has a cost that is to be as low as possible."""
 
     @property
     def cost(self) -> float:
-        """What is to be as low as possible."""
+        """That cost."""
+
+
+class Point(Costed, Protocol):
+    """One point of a problem."""
 
     def gradient(self) -> tuple[np.ndarray, np.ndarray]:
         """Its derivatives by the frames' unknowns, in the shape of a step, and by the shared ones."""
 
 
+_There = TypeVar("_There", bound=Costed)
 _Point = TypeVar("_Point", bound=Point)
 
 
@@ -181,15 +186,6 @@ def descend(
         return None
     slope = float((frames * step[0]).sum() + shared @ step[1])
     return search_line(here.cost, slope, lambda share: moved(share * step[0], share * step[1]))
-
-
-class _Costed(Protocol):
-    @property
-    def cost(self) -> float:
-        """As of a point."""
-
-
-_There = TypeVar("_There", bound=_Costed)
 
 
 def search_line(cost: float, slope: float, point_at: Callable[[float], _There | None]) -> _There | None:

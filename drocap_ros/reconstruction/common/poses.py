@@ -60,10 +60,6 @@ def packed(full: np.ndarray) -> np.ndarray:
 #: Least standard deviation of a joint's depth in the evidence, mm of an ordinary person: of the best single-image
 #: methods on their own test sets, per joint.
 _LEAST_MM = 30.0
-#: Errors in depth over those across the image, which can be measured: of BlazePose on three videos with optical MoCap.
-_DEEPER = 1.5
-#: Most frames with evidence may lack a bone; one of them is enough for the scale.
-_LEAST_LENGTH = 1e-9
 
 
 @dataclass(frozen=True)
@@ -94,7 +90,8 @@ class Evidence:
         about = self.joints - self.joints[:, :1]
         theirs = np.linalg.norm(about[:, child] - about[:, parent], axis=-1)
         ours = np.linalg.norm(pose_mm[:, child] - pose_mm[:, parent], axis=-1)
-        known = np.isfinite(theirs) & (theirs > _LEAST_LENGTH)
+        # Most frames with evidence may lack a bone; one of them is enough for the scale.
+        known = np.isfinite(theirs) & (theirs > 1e-9)
         if not known.any():
             return np.full(pose_mm.shape[:2], np.nan), np.full(pose_mm.shape[:2], np.inf)
         about = about * float(np.median(ours[known]) / np.median(theirs[known]))
@@ -102,7 +99,9 @@ class Evidence:
         gap = about[..., :2] - (pose_mm - pose_mm[:, :1])[..., :2]
         count = np.maximum(np.isfinite(gap[..., 0]).sum(axis=0), 1)
         across = np.sqrt(np.nansum(np.square(gap), axis=(0, 2)) / (2 * count))
-        sigma = np.fmax(np.fmax(self.sigma * scale, _DEEPER * across), _LEAST_MM)
+        # Errors in depth over those across the image, which can be measured: of BlazePose on three videos with optical
+        # MoCap.
+        sigma = np.fmax(np.fmax(self.sigma * scale, 1.5 * across), _LEAST_MM)
         return about[..., 2], np.where(np.isfinite(about[..., 2]), sigma, np.inf)
 
 

@@ -20,10 +20,8 @@ FEATURES = sum(PARTS)
 _TORSO = indices(BODY_17.joints, ("pelvis", "rhip", "lhip", "neck", "lshoulder", "rshoulder"))
 #: Limit of the features of places, in sizes of the person, as in the training.
 _CLIP = 6.0
-#: Factors of the training: they bring standard deviations (share of the size) to the order of one,
+#: Factor of the training that brings standard deviations (share of the size) to the order of one.
 _STD_FACTOR = 10.0
-#: and turns (rad per frame).
-_TURN_FACTOR = 20.0
 
 
 def nanmedian_small(values: np.ndarray, axis: int) -> np.ndarray:
@@ -141,7 +139,8 @@ def _camera_features(shape: tuple[int, ...], rotation: np.ndarray | None) -> tup
     # The turn of a frame is small: the skew part is the rotation vector.
     skew = step - np.swapaxes(step, -1, -2)
     turn = np.zeros((*shape, 3))
-    turn[..., 1:, :] = 0.5 * _TURN_FACTOR * np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+    # The factor 20 of the training brings turns (rad per frame) to the order of one.
+    turn[..., 1:, :] = 0.5 * 20.0 * np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
     turn[..., 1:, :] *= (known[..., 1:] & known[..., :-1])[..., None]
     return turn, -usual[..., :, 2] * known[..., None], known[..., None]
 

@@ -89,11 +89,10 @@ class WorldChain:
         """The next window in the world; None = too short.  ``extra`` : priors of this window alone."""
         known = self._prior(camera.stamp_ns)
         every = known if extra is None else known.later(extra, 1.0, 0.0)
-        found = in_world(camera, keypoints, poses, per_px, config, every, self._before_in(camera))
-        if found.refined is None:
-            return found.refusal
-        self._known, self._last = known, _Last(found.refined.before, found.refined.found, camera)
-        return found.refined
+        _, found = in_world(camera, keypoints, poses, per_px, config, every, self._before_in(camera))
+        if isinstance(found, RefinedWorld):
+            self._known, self._last = known, _Last(found.before, found.found, camera)
+        return found
 
     def _continued(self, stamps: np.ndarray) -> _Last | None:
         """The window before, where the window of these stamps shares frames with it."""

@@ -66,9 +66,8 @@ def run_factorization(data: MethodInput) -> ImagePoses:
 
     def solve(rows: slice) -> ImagePoses:
         n = normalize_tracks(data.keypoints[rows])
-        poses, terms, iterations, stop = factorize(n.w, n.information, dictionary, data.adjuster)
-        placed = Projection(n.w, n.information).placed(poses)
-        return ImagePoses.uncentred(n.in_px(placed), report=Report(iterations, stop, terms))
+        poses, report = factorize(n.w, n.information, dictionary, data.adjuster)
+        return ImagePoses.uncentred(n.in_px(Projection(n.w, n.information).placed(poses)), report=report)
 
     return _timed(over_windows(data, solve), 0.0, time.perf_counter() - clock, dictionary)
 
@@ -95,10 +94,9 @@ def _initial_poses(data: MethodInput, dictionary: Dictionary) -> tuple[np.ndarra
     inlier = np.zeros(keypoints.xy.shape[:2])
     for rows in windows(len(keypoints), config.block_frames, 0):
         n = normalize_tracks(keypoints[rows])
-        fit = initialize(n.w, n.information, dictionary, config)
-        shape = fit.camera_shape
+        shape, information = initialize(n.w, n.information, dictionary, config)
         before = n.information[..., 0] + n.information[..., 2]
-        after = fit.information[..., 0] + fit.information[..., 2]
+        after = information[..., 0] + information[..., 2]
         inlier[rows] = after / np.where(before > 0.0, before, 1.0)
         out[rows] = (shape - shape.mean(axis=1, keepdims=True)) * n.scale_px
         data.progress("initial", rows.stop / len(keypoints))

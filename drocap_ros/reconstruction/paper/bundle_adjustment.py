@@ -10,7 +10,6 @@ S is updated by the accelerated proximal gradient method with backtracking and r
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
@@ -84,9 +83,6 @@ def articulation_term(s: np.ndarray) -> tuple[float, np.ndarray]:
     limbs *= 4.0 * excess
     return float(np.vdot(excess, excess)), LIMBS.T @ limbs
 
-
-#: Window length for which alpha is given: the protocol's 10 s at 24 fps.
-REFERENCE_FRAMES = 240
 
 #: Windows of fewer frames are not adjusted: their views are too similar.
 MIN_WINDOW = 4
@@ -172,7 +168,8 @@ def effective_alpha(projection: Projection, config: BundleAdjusterConfig) -> flo
     frames, p = w.shape[:2]
     hiding = 2.0 * noise_std(w, information) * (np.sqrt(frames) + np.sqrt(2.0 * p)) if config.noise_alpha > 0.0 else 0.0
     most = 0.1 * float(np.linalg.norm(projection.w.reshape(-1, frames), 2))
-    return float(max(config.alpha * np.sqrt(frames / REFERENCE_FRAMES), min(config.noise_alpha * hiding, most)))
+    # Window length for which alpha is given: the protocol's 10 s at 24 fps.
+    return float(max(config.alpha * np.sqrt(frames / 240), min(config.noise_alpha * hiding, most)))
 
 
 def bundle_adjust(
@@ -195,7 +192,7 @@ def bundle_adjust(
     shape = (s0 - s0.mean(axis=1, keepdims=True)) @ body
     projection = Projection(w, information)
     objective = Objective(projection, np.ascontiguousarray(np.moveaxis(body, 0, -1)), config)
-    s, outcome = minimize(objective, frames_last(shape))
+    s, history, stop = minimize(objective, frames_last(shape))
     terms = objective.terms(s)
     return AdjustmentResult(
         shape=frames_first(s),
@@ -203,28 +200,20 @@ def bundle_adjust(
         translation=projection.translation(rotate(objective.rotation, s, 2)).T,
         cost=sum(terms.values()),
         cost_terms=terms,
-        iterations=outcome.iterations,
-        stop_reason=outcome.stop_reason,
-        history=outcome.history,
+        iterations=len(history) - 1,
+        stop_reason=stop,
+        history=history,
     )
 
 
-class Outcome(NamedTuple):
-    """Steps, why the solver stopped, and the cost (iterations + 1,) after each step."""
-
-    iterations: int
-    stop_reason: str
-    history: np.ndarray
-
-
-def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, Outcome]:
+def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
     """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise.
 
     s : (3, P, F) initial shapes
 
     Returns
     -------
-    shapes (3, P, F), and what the solver did
+    shapes (3, P, F), the cost (iterations + 1,) after each step, and why the solver stopped
     """
     config, alpha = objective.config, objective.alpha
     cost = objective.value(s) + alpha * nuclear_norm(s)
@@ -248,7 +237,7 @@ def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, Outcome]:
         if k >= 20 and history[-11] - cost <= config.tolerance * abs(cost):
             stop = CONVERGED
             break
-    return s, Outcome(len(history) - 1, stop, np.array(history))
+    return s, np.array(history), stop
 
 
 def _proximal_step(objective: Objective, at: np.ndarray, mu: float) -> tuple[np.ndarray, float, float]:

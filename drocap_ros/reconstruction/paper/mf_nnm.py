@@ -14,16 +14,13 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.geometry.rotations import complete_rotation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.paper.bundle_adjustment import Objective, Outcome, minimize
+from drocap_ros.reconstruction.common.poses import Report
+from drocap_ros.reconstruction.paper.bundle_adjustment import Objective, minimize
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, normalize_poses
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
 
 #: Candidates of K in the rank 3K of the factorization.
 BASIS_SHAPES = (2, 3)
-#: Proximal gradient steps of the metric upgrade, chosen by hand.
-_TRACE_STEPS = 300
-#: Gauss-Newton steps of its refinement, chosen by hand.
-_REFINING_STEPS = 30
 #: Two orthographic images fix no rotation.
 MIN_IMAGES = 3
 #: Of depth: what a factorization leaves open.
@@ -35,14 +32,14 @@ def factorize(
     information: np.ndarray,
     dictionary: Dictionary,
     config: BundleAdjusterConfig,
-) -> tuple[np.ndarray, dict[str, float], int, str]:
+) -> tuple[np.ndarray, Report]:
     """Poses of one window by MF+NNM.
 
     w, information : (F, P, 2) and (F, P, 3), normalized; missing joints are interpolated for the factorization
 
     Returns
     -------
-    poses (F, P, 3) in camera axes, cost per term, iterations, stop reason
+    poses (F, P, 3) in camera axes, and what the solver did
     """
     if len(w) < MIN_IMAGES:
         raise InputError(
@@ -54,11 +51,10 @@ def factorize(
     found = []
     for basis_shapes in BASIS_SHAPES:
         rotation = rotations_by_factorization(full, basis_shapes)
-        shape, terms, outcome = minimize_nuclear_norm(w, information, rotation, config)
+        shape, report = minimize_nuclear_norm(w, information, rotation, config)
         poses = shape @ np.swapaxes(rotation, 1, 2)
-        found += [(candidate, terms, outcome) for candidate in (poses, poses * MIRROR)]
-    poses, terms, outcome = min(found, key=lambda one: _distance(one[0], dictionary))
-    return poses, terms, outcome.iterations, outcome.stop_reason
+        found += [(candidate, report) for candidate in (poses, poses * MIRROR)]
+    return min(found, key=lambda one: _distance(one[0], dictionary))
 
 
 def minimize_nuclear_norm(
@@ -68,16 +64,16 @@ def minimize_nuclear_norm(
     config: BundleAdjusterConfig,
     *,
     initial: np.ndarray | None = None,
-) -> tuple[np.ndarray, dict[str, float], Outcome]:
-    """Shapes (F, P, 3) in the common frame for known rotations (F, 3, 3); cost per term; the solver's outcome.
+) -> tuple[np.ndarray, Report]:
+    """Shapes (F, P, 3) in the common frame for known rotations (F, 3, 3), and what the solver did.
 
     Without ``initial`` the first shapes are the joints back-projected into the common frame without depth.
     """
     centred = w - w.mean(axis=1, keepdims=True)
     s = frames_last(centred @ rotation[:, :2] if initial is None else initial)
     fixed = _FixedCameras(Projection(w, information), np.ascontiguousarray(np.moveaxis(rotation, 0, -1)), config)
-    s, outcome = minimize(fixed, s)
-    return frames_first(s), fixed.terms(s), outcome
+    s, history, stop = minimize(fixed, s)
+    return frames_first(s), Report(len(history) - 1, stop, fixed.terms(s))
 
 
 class _FixedCameras(Objective):
@@ -120,7 +116,8 @@ def metric_upgrade(motion: np.ndarray) -> np.ndarray:
     step = 1.0 / np.linalg.norm(gram, 2)
     q = ahead = np.eye(rank) / rank
     t, trace_weight = 1.0, 1e-3
-    for _ in range(_TRACE_STEPS):
+    # Proximal gradient steps of the metric upgrade, chosen by hand.
+    for _ in range(300):
         slope = (gram @ ahead.ravel() - moment).reshape(rank, rank)
         values, vectors = np.linalg.eigh(_symmetric(ahead - step * slope))
         new = (vectors * np.maximum(values - step * trace_weight, 0.0)) @ vectors.T
@@ -151,7 +148,8 @@ def _refine_upgrade(g: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
     gap, jac = residuals(g)
     damping = 1e-2
-    for _ in range(_REFINING_STEPS):
+    # Gauss-Newton steps of its refinement, chosen by hand.
+    for _ in range(30):
         hessian = jac.T @ jac
         move = np.linalg.solve(
             hessian + damping * (np.trace(hessian) / len(hessian)) * np.eye(len(hessian)), jac.T @ gap

@@ -19,14 +19,12 @@ class NormalizedTracks:
     """Tracks in the solvers' units: ``px = w * scale_px + centre_px``.
 
     w : (F, P, 2), 0 where not seen
-    weights : (F, P) >= 0, 0 where not seen; the confidence
     information : (F, P, 3) xx, xy, yy weight of each joint in the reprojection term; 1, 0, 1 is an ordinary joint
     centre_px : (F, 2)
     scale_px : px per unit; the standard deviation of all centred coordinates of seen joints
     """
 
     w: np.ndarray
-    weights: np.ndarray
     information: np.ndarray
     centre_px: np.ndarray
     scale_px: float
@@ -65,7 +63,7 @@ def normalize_tracks(keypoints: Keypoints2D) -> NormalizedTracks:
     w = w / scale_px
     units = None if covariance is None else covariance / scale_px**2
     information = information_from(np.where(seen[..., None], w, np.nan), weights, units)
-    return NormalizedTracks(w, weights, information, _filled(centre, count > 0), scale_px)
+    return NormalizedTracks(w, information, _filled(centre, count > 0), scale_px)
 
 
 def check_uncertainty(keypoints: Keypoints2D, seen: np.ndarray) -> None:

@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Bound on the gain of a joint of vanishing variance.
-_LARGEST_GAIN = 4.0
-
 
 def information_from(w: np.ndarray, weights: np.ndarray | None, covariance: np.ndarray | None) -> np.ndarray:
     """(F, P, 3) information xx, xy, yy per joint; 1, 0, 1 is an ordinary joint, 0 a missing one.
@@ -26,7 +23,8 @@ def information_from(w: np.ndarray, weights: np.ndarray | None, covariance: np.n
     xx, xy, yy = (np.where(use, covariance[..., i], 1.0 - (i == 1)) for i in range(3))
     ordinary = float(np.median(0.5 * (xx + yy)[use])) if use.any() else 1.0
     # Adding a floor to both axes bounds the information and keeps it positive definite.
-    floor = ordinary / _LARGEST_GAIN
+    # Bound on the gain of a joint of vanishing variance.
+    floor = ordinary / 4.0
     xx, yy = xx + floor, yy + floor
     scale = base * (ordinary + floor) / (xx * yy - xy * xy)
     return np.stack([scale * yy, -scale * xy, scale * xx], axis=-1)

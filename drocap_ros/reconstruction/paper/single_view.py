@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from drocap_ros.reconstruction.common.config import InitializerConfig
@@ -11,37 +9,18 @@ from drocap_ros.reconstruction.paper.dictionary import Dictionary, sparse_code
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.paper.viewpoint_search import SparseFit, fit_sparse, search_viewpoints
 
-#: Area over which gross outliers are uniform, squared 2D std: about that of the person's box.
-OUTLIER_AREA = 12.0
-
-
-@dataclass(frozen=True)
-class SingleViewFit:
-    """Initial poses, in the unit of the 2D joints.
-
-    shape : (F, P, 3) torso frame
-    rotation : (F, 3, 3) torso -> camera
-    information : (F, P, 3) of the 2D joints after the last E-step
-    """
-
-    shape: np.ndarray
-    rotation: np.ndarray
-    information: np.ndarray
-
-    @property
-    def camera_shape(self) -> np.ndarray:
-        """(F, P, 3) poses in camera axes."""
-        turned: np.ndarray = self.shape @ np.swapaxes(self.rotation, 1, 2)
-        return turned
-
 
 def initialize(
     w: np.ndarray, information: np.ndarray, dictionary: Dictionary, config: InitializerConfig
-) -> SingleViewFit:
+) -> tuple[np.ndarray, np.ndarray]:
     """Poses of all frames: viewpoint search, choice over time, sparse refinement within EM over the 2D joints.
 
     w : (F, P, 2) centred joints in units of their standard deviation, 0 where the information is 0
     information : (F, P, 3) of :func:`~drocap_ros.reconstruction.paper.reprojection.information_from`
+
+    Returns
+    -------
+    poses (F, P, 3) in camera axes and the unit of the joints; information (F, P, 3) after the last E-step
     """
     measured = information
     dense = search_viewpoints(w, information, dictionary, config)
@@ -57,12 +36,12 @@ def initialize(
             information = expected_information(
                 w, measured, projected_joints(projection, fit), config.keypoint_std, outlier_share=config.outlier_share
             )
-    return SingleViewFit(fit.shape, fit.rotation, information)
+    return fit.camera_shape, information
 
 
 def projected_joints(projection: Projection, fit: SparseFit) -> np.ndarray:
     """(F, P, 2) the model's joints in the image."""
-    flat = frames_last((fit.shape @ np.swapaxes(fit.rotation, 1, 2))[..., :2])
+    flat = frames_last(fit.camera_shape[..., :2])
     return frames_first(flat + projection.translation(flat)[:, None])
 
 
@@ -112,7 +91,8 @@ def expected_information(
     outlier_share : prior probability of an outlier
     """
     fit = _log_density(projected - w, information / std**2)
-    inlier = _share(fit + np.log1p(-outlier_share), np.log(outlier_share / OUTLIER_AREA))
+    # Area over which gross outliers are uniform, squared 2D std: about that of the person's box.
+    inlier = _share(fit + np.log1p(-outlier_share), np.log(outlier_share / 12.0))
     expected: np.ndarray = information * inlier[..., None]
     return expected
 

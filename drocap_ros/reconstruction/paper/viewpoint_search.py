@@ -31,6 +31,12 @@ class SparseFit:
     rotation: np.ndarray
     shape: np.ndarray
 
+    @property
+    def camera_shape(self) -> np.ndarray:
+        """(F, P, 3) poses in camera axes."""
+        turned: np.ndarray = self.shape @ np.swapaxes(self.rotation, 1, 2)
+        return turned
+
 
 def fit_sparse(
     projection: Projection,
@@ -87,8 +93,6 @@ def _shapes(basis: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 #: Poses fitted in one batch: their Jacobians fit the processor's cache.
 CHUNK = 256
-#: Spread of the scale in the first half of the steps, over the configured one; chosen by hand.
-_LOOSE = 3.0
 
 
 @dataclass(frozen=True)
@@ -153,7 +157,8 @@ def search_viewpoints(
     scale = image_scale(w, information, dictionary)
     coefficients[:, 0] = scale
     # The scale is common to the sequence: fit it loosely first, then hold the frames to their median.
-    loose = search.fit(rotation, coefficients, scale, _LOOSE * config.scale_std, half)
+    # Spread of the scale in the first half of the steps, over the configured one; chosen by hand.
+    loose = search.fit(rotation, coefficients, scale, 3.0 * config.scale_std, half)
     best = np.argmin(loose.cost.reshape(count, frames), axis=0)
     scale = float(np.median(loose.coefficients.reshape(count, frames, -1)[best, np.arange(frames), 0]))
     fit = search.fit(loose.rotation, loose.coefficients, scale, config.scale_std, config.search_iterations - half)

@@ -11,10 +11,6 @@ from drocap_ros.geometry.alignment import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3, project_to_so3
 from drocap_ros.reconstruction.together.view import View
 
-#: Distance (m) of a joint about the pelvis at which it counts half: signs of depth are wrong in every sixth limb.
-_HALF_M = 0.1
-#: Rounds of the robust fit, each from the weights of the one before.
-_ROUNDS = 15
 #: Times (1/s) at which bodies are compared.
 _RATE_HZ = 10.0
 #: Standard deviations (s) of the averages of a camera's turn and place beside a body: a drone turns by 10 degrees in
@@ -87,7 +83,8 @@ def _turn(a: np.ndarray, b: np.ndarray, upright: bool) -> tuple[np.ndarray, floa
     """Rotations (S, 3, 3) that take points b (S, N, 3) to a at so many instants, robust, and the median distance."""
     weight = np.ones(a.shape[:2])
     rotation, distance = np.eye(3), np.zeros(a.shape[:2])
-    for _ in range(_ROUNDS):
+    # Rounds of the robust fit, each from the weights of the one before.
+    for _ in range(15):
         cross = np.swapaxes(a, 1, 2) @ (weight[..., None] * b)
         if len(cross) > 1:
             cross = gaussian_filter1d(cross, _TURN_S * _RATE_HZ, axis=0, mode="nearest")
@@ -97,5 +94,7 @@ def _turn(a: np.ndarray, b: np.ndarray, upright: bool) -> tuple[np.ndarray, floa
         else:
             rotation = project_to_so3(cross)
         distance = np.linalg.norm(a - b @ np.swapaxes(rotation, 1, 2), axis=-1)
-        weight = 1.0 / np.square(1.0 + np.square(distance / _HALF_M))
+        # Distance (m) of a joint about the pelvis at which it counts half: signs of depth are wrong in every sixth
+        # limb.
+        weight = 1.0 / np.square(1.0 + np.square(distance / 0.1))
     return rotation, float(np.median(distance))

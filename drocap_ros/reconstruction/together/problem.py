@@ -19,12 +19,8 @@ from drocap_ros.reconstruction.world.world_model import Doubt, WorldInput
 #: Errors of a place and an attitude that the bodies of single views give: their depths err by a tenth of the range, and
 #: a body that is turned a little looks as one that faces the camera: two phones 38 degrees apart seemed to be 20.
 _PLACED_M, _PLACED_DEG = 0.5, 15.0
-#: Deviation (rad) of a turn that all bodies of a view's lifter have in common, as its errors last,
+#: Deviation (rad) of a turn that all bodies of a view's lifter have in common, as its errors last.
 _LEAN = 0.15
-#: and of the logarithm of bone lengths as single views give them: several views measure them.
-_LENGTH_STD = 0.02
-#: and the slow errors of a path beside those that its own recording knows of, before they are measured.
-_WANDER_M = 0.3
 #: Most of them that is believed: of a receiver without corrections; more is another motion.
 _MOST_WANDER_M = 0.6
 #: Time (s) in which a slow error is measured, and its change in that time over its standard deviation: the path's
@@ -34,8 +30,6 @@ _CHANGE_S, _CHANGE = 5.0, 0.4
 _LEAST_PLACED_M = 0.02
 #: Adjustments, each from the times and places that the one before has measured, and the change that ends them.
 _ROUNDS, _SAME_S, _SAME_LENS = 5, 5e-4, 5e-3
-#: Usual error of a keypoint, share of the body's height in the image.
-_KEYPOINT_ERROR = 0.004
 #: Weight of the body as single views have it, in a start from the rays of all: deviation (m) of a joint.
 _SINGLE_M = 0.3
 
@@ -106,7 +100,8 @@ class JoinedProblem:
         doubt = Doubt(lens=(0.0, view.focal_std), lean_std=_LEAN)
         if number == self.home:
             return doubt
-        home, wander_m = self.views[self.home], 0.0 if view.own_world and view.stands else _WANDER_M
+        # Slow errors of a path beside those that its own recording knows of, before they are measured.
+        home, wander_m = self.views[self.home], 0.0 if view.own_world and view.stands else 0.3
         placed = doubt._replace(placed_m=_PLACED_M, wander_m=wander_m)
         if view.reported and home.reported:
             return placed
@@ -162,7 +157,8 @@ class JoinedProblem:
         # Bones between joints that err are too long: those of the bodies that single views give.
         lengths = np.mean([np.median(span_lengths(view.joints), axis=0) for view in self.views], axis=0)
         beside = Beside(tuple(inputs[1:]), inputs[0].doubt, lengths)
-        config = replace(inputs[0].config, length_std=_LENGTH_STD)
+        # Several views measure bone lengths: those that single views give have this deviation of their logarithm.
+        config = replace(inputs[0].config, length_std=0.02)
         found = refine_in_world(first.camera, first.solved.keypoints, first.placed_poses(start), config, beside=beside)
         assert not isinstance(found, Refusal)
         return found
@@ -209,12 +205,13 @@ class JoinedProblem:
         alone = self.views[number].solved.motion.reprojection_px[:, :17]
         doubt, height = self._doubts[number], keypoints[np.isfinite(keypoints).any(axis=(1, 2)), :, 1]
         size = float(np.median(np.nanmax(height, axis=1) - np.nanmin(height, axis=1)))
+        # Usual error of a keypoint, share of the body's height in the image.
         return {
             "offset_s": self.offsets[number],
             "offset_std_s": float(np.hypot(self.offset_std[number], self.offset_std[0])) if number else 0.0,
             "median_px": float(np.nanmedian(off)),
             "median_px_alone": float(np.nanmedian(alone)),
-            "misfit": float(np.nanmedian(off)) / max(float(np.nanmedian(alone)), _KEYPOINT_ERROR * size),
+            "misfit": float(np.nanmedian(off)) / max(float(np.nanmedian(alone)), 0.004 * size),
             "placed_m": doubt.placed_m,
             "focal_px": 0.5 * float(view.camera_matrix[0, 0] + view.camera_matrix[1, 1]),
             "by_body": not (self.views[number].own_world or self.views[number].stands),

@@ -6,23 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.geometry.interpolation import usual_step
+from drocap_ros.geometry.interpolation import peak, usual_step
 from drocap_ros.skeleton import BODY_17, indices
 
 #: Rate (Hz) at which motions are compared.
 RATE_HZ = 100.0
-#: Standard deviation (s) of the average that is taken out: what stays is motion, without posture and errors that last.
-_SLOW_S = 1.0
-#: Standard deviation (s) of the average that takes noise out.
-_FAST_S = 0.03
 #: Shortest time (s) in which two recordings show the person together.
 LEAST_S = 1.5
 #: Joints whose heights above the pelvis and whose distances from each other are compared.
 _MOVING = ("head", "rwrist", "lwrist", "relbow", "lelbow", "rknee", "lknee", "rankle", "lankle")
-#: Longest time (s) without the person that is bridged.
-_HIDDEN_S = 0.3
-#: Weight of a distance against that of a height: depths of a single view err.
-_DISTANCE_WEIGHT = 0.3
 #: Time (s) between two different answers: motions repeat themselves after a step at the earliest.
 _APART_S = 0.3
 
@@ -62,7 +54,7 @@ def time_offsets(first: ShownMotion, second: ShownMotion, *, level: bool = True)
     found: list[TimeOffset] = []
     while len(found) < 4 and left.max() > 0.0:
         best = int(left.argmax())
-        seconds = (lag[best] + _peak(score, best)) / RATE_HZ + first.time_s[0] - second.time_s[0]
+        seconds = (lag[best] + peak(score, best)) / RATE_HZ + first.time_s[0] - second.time_s[0]
         left[max(best - round(_APART_S * RATE_HZ), 0) : best + round(_APART_S * RATE_HZ) + 1] = 0.0
         found.append(TimeOffset(float(seconds), float(score[best])))
     return found
@@ -79,15 +71,20 @@ def _signals(motion: ShownMotion, level: bool) -> np.ndarray:
     at = indices(BODY_17.joints, _MOVING)
     one, other = np.triu_indices(len(at), 1)
     distance = np.linalg.norm(joints[:, at[one]] - joints[:, at[other]], axis=-1)
-    values = np.concatenate([level * (joints[:, at, 2] - joints[:, :1, 2]), _DISTANCE_WEIGHT * distance], axis=1)
+    # Weight of a distance against that of a height: depths of a single view err.
+    values = np.concatenate([level * (joints[:, at, 2] - joints[:, :1, 2]), 0.3 * distance], axis=1)
     even = np.arange(time[0], time[-1], 1.0 / RATE_HZ)
     values = np.stack([np.interp(even, time, column) for column in values.T], axis=1)
-    smooth = max(_FAST_S, usual_step(time)) * RATE_HZ
+    # Standard deviation (s) of the average that takes noise out.
+    smooth = max(0.03, usual_step(time)) * RATE_HZ
     values = gaussian_filter1d(values, smooth, axis=0, mode="nearest")
-    values -= gaussian_filter1d(values, _SLOW_S * RATE_HZ, axis=0, mode="nearest")
+    # Standard deviation (s) of the average that is taken out: what stays is motion, without posture and errors that
+    # last.
+    values -= gaussian_filter1d(values, RATE_HZ, axis=0, mode="nearest")
     shown = np.concatenate([[-np.inf], time[motion.seen], [np.inf]])
     after = np.searchsorted(shown, even)
-    values[shown[after] - shown[after - 1] > _HIDDEN_S] = 0.0
+    # Longest time (s) without the person that is bridged.
+    values[shown[after] - shown[after - 1] > 0.3] = 0.0
     return np.asarray(values)
 
 
@@ -109,12 +106,3 @@ def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
     # A long time together says more than a short one that is as alike.
     score *= np.minimum(1.0, overlap / shorter) ** 0.25
     return np.where(overlap >= LEAST_S * RATE_HZ - 0.5, score, 0.0)
-
-
-def _peak(score: np.ndarray, best: int) -> float:
-    """Place of the parabola's top through three scores, in samples from the middle one."""
-    if not 0 < best < len(score) - 1:
-        return 0.0
-    before, here, after = score[best - 1 : best + 2]
-    bend = before - 2.0 * here + after
-    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0

@@ -28,10 +28,6 @@ from drocap_ros.reconstruction.world.world_model import (
     world_config,
 )
 
-#: Longest time (s) between two images between which a joint is interpolated.
-_GAP_S = 0.1
-#: Way (m) within which a camera stands.
-_STANDS_M = 0.05
 #: Errors of a camera on a tripod: of its attitude none but that of its placement.
 _STANDING = WorldConfig(
     errors=CameraErrors(latency_s=1e-3, position_wander_m=0.002, attitude_wander_deg=0.01), checks=False
@@ -127,7 +123,8 @@ class View:
     @property
     def stands(self) -> bool:
         """Whether the camera stands."""
-        return bool(np.ptp(self.camera.pose[1], axis=0).max() < _STANDS_M)
+        # Way (m) within which a camera stands.
+        return bool(np.ptp(self.camera.pose[1], axis=0).max() < 0.05)
 
     def moved(self, scale: float, rotation: np.ndarray, translation: np.ndarray) -> View:
         """The view in another world: ``place there = scale * rotation @ place + translation``, by image or for all."""
@@ -202,7 +199,8 @@ class _Between:
         gap = own_s[after] - own_s[before]
         # In no time nothing is passed.
         self._part = np.clip((time_s - own_s[before]) / np.where(gap > 0.0, gap, np.inf), 0.0, 1.0)
-        near = gap < max(_GAP_S, 1.5 * usual_step(own_s))
+        # Longest time (s) between two images between which a joint is interpolated.
+        near = gap < max(0.1, 1.5 * usual_step(own_s))
         self.inside = near & (time_s >= own_s[before]) & (time_s <= own_s[after])
 
     def of(self, values: np.ndarray) -> np.ndarray:

@@ -7,9 +7,6 @@ import numpy as np
 from drocap_ros.geometry.interpolation import smoothed
 from drocap_ros.geometry.rotations import exp_so3, log_so3
 
-#: Standard deviation (s) of the average of the reported motion: longer than noise lasts, shorter than a manoeuvre.
-_SMOOTHING_S = 0.25
-
 
 class CameraTelemetry:
     """Reported rotations (F, 3, 3) world -> camera and positions (F, 3) m of evenly spaced frames.
@@ -29,7 +26,9 @@ class CameraTelemetry:
         if self.frames > 1:
             step = log_so3(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)) * fps
             turn = np.concatenate([step[:1], 0.5 * (step[1:] + step[:-1]), step[-1:]])
-        smoothing = _SMOOTHING_S * fps
+        # Standard deviation (s) of the average of the reported motion: longer than noise lasts, shorter than a
+        # manoeuvre.
+        smoothing = 0.25 * fps
         self.turn_rate = gaussian_filter1d(turn, smoothing, axis=0, mode="nearest")
         self._smooth = smoothed(position, smoothing)
         self.velocity = np.gradient(self._smooth, axis=0) * fps if self.frames > 1 else np.zeros((self.frames, 3))

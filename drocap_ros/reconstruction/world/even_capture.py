@@ -23,8 +23,6 @@ _WINDOW = 960
 _OVERLAP = 48
 #: Least noise (px) of a keypoint: no network is better.
 _LEAST_NOISE_PX = 0.5
-#: Weight of the lifter's image position of a joint that is not seen: its errors last for many frames.
-_GUESS_WEIGHT = 0.1
 #: Share of the time in which an ankle has to be seen for the feet to tell wrong telemetry.
 _SEEN_SHARE = 0.3
 #: A part of a recording that is shorter may hold no step: its feet tell nothing.
@@ -152,4 +150,5 @@ def keypoint_weights(keypoints: Keypoints2D, image_sigma: np.ndarray) -> np.ndar
     if variance is not None:
         square = np.where(np.isfinite(variance), np.maximum(variance, _LEAST_NOISE_PX**2), square)
     weights = np.clip(keypoints.weights, 0.0, 1.0) / square
-    return np.where(keypoints.seen, weights, _GUESS_WEIGHT / np.square(np.maximum(image_sigma, _LEAST_NOISE_PX)))
+    # Weight of the lifter's image position of a joint that is not seen: its errors last for many frames.
+    return np.where(keypoints.seen, weights, 0.1 / np.square(np.maximum(image_sigma, _LEAST_NOISE_PX)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,14 +20,6 @@ from drocap_ros.skeleton import BODY_15
 _PELVIS = BODY_15.index("pelvis")
 
 
-class WorldResult(NamedTuple):
-    """Poses as the reported camera places them; and adjusted with it, or why not, where there is enough telemetry."""
-
-    placed: WorldPoses
-    refined: RefinedWorld | None = None
-    refusal: Refusal | None = None
-
-
 def in_camera_axes(poses: ImagePoses, per_px: np.ndarray) -> np.ndarray:
     """(F, P, 3) m in the camera's axes, pelvis at the origin, at (F,) metres per px."""
     joints: np.ndarray = (poses.joints_px - poses.joints_px[:, _PELVIS][:, None]) * per_px[:, None, None]
@@ -43,8 +34,8 @@ def in_world(
     config: WorldConfig | None,
     known: Findings | None = None,
     before: Before | None = None,
-) -> WorldResult:
-    """Poses placed by the camera's rotation and, with its position and matrix, adjusted with it.
+) -> tuple[WorldPoses, RefinedWorld | Refusal | None]:
+    """Poses placed by the camera's rotation and, with its position and matrix, adjusted with it, or why not.
 
     keypoints : of the method's joints
     per_px : (F,) metres per px at the assumed stature
@@ -60,11 +51,10 @@ def in_world(
     placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, camera)
     refusal = upside_down(placed.joints, rotation) if sigma is not None and config and config.checks else None
     if refusal or sigma is None or config is None or not whole or not np.isfinite(placed.joints).all():
-        return WorldResult(placed, refusal=refusal)
+        return placed, refusal
     size = per_px[:, None]
     depth = (poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]) * size
     given = PlacedPoses(
         placed.joints, placed.factor, depth, sigma[..., 1] * size, projected, sigma[..., 0], poses.still
     )
-    found = refine_in_world(camera, keypoints, given, config, known, before)
-    return WorldResult(placed, refusal=found) if isinstance(found, Refusal) else WorldResult(placed, found)
+    return placed, refine_in_world(camera, keypoints, given, config, known, before)

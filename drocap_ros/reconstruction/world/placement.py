@@ -29,11 +29,11 @@ MOST_PAIRS = 4000
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """Factor on the assumed scale, its relative standard deviation, and the share of still feet."""
+    """Factor on the assumed scale, its relative standard deviation, and the share of still feet, 0 = by other means."""
 
     factor: float
     std: float
-    support: float
+    support: float = 0.0
 
     @property
     def trusted(self) -> bool:
@@ -99,14 +99,11 @@ def _pairs(feet: np.ndarray, camera: np.ndarray, stamp_ns: np.ndarray) -> tuple[
     return np.concatenate(gaps), np.concatenate(bases)
 
 
-#: Standard deviation (s) of the average of the person's image size: a drone changes its range slowly.
-_SIZE_SMOOTHING_S = 1.0
-
-
 def metres_per_px(joints_px: np.ndarray, stamp_ns: np.ndarray, height_m: float) -> np.ndarray:
     """(F,) metres per px that give the body of poses (F, 15, 3) px the limb lengths of a person of ``height_m``."""
     total = limb_lengths(joints_px).sum(-1)
-    size = np.maximum(smooth_over_time(total, stamp_ns, _SIZE_SMOOTHING_S), 1e-9)
+    # Standard deviation (s) of the average of the person's image size: a drone changes its range slowly.
+    size = np.maximum(smooth_over_time(total, stamp_ns, 1.0), 1e-9)
     return np.asarray(height_m * LIMBS_PER_STATURE / size)
 
 

@@ -54,10 +54,6 @@ from drocap_ros.reconstruction.world.world_model import (
 _HELD = 2
 #: Cost of the telemetry per frame that no camera's flight explains.
 _LARGEST_COST = 100.0
-#: Least share of the time with a foot in contact: jogging has 0.2, a yaw off by 40 degrees less than 0.01.
-_LEAST_CONTACT = 0.03
-#: Frames per second below which a step of a foot ends between two frames: contacts are not seen.
-_CONTACTS_FPS = 8.0
 
 
 class Beside(NamedTuple):
@@ -274,13 +270,15 @@ class _Facts:
         self.lens.append(found.state.lens.tolist())
         self.metric &= bool(found.std[SCALE] < MEASURED * found.state.globals[SCALE])
         self._cost = max(self._cost, found.cost_terms["telemetry"] / len(found.joints))
-        if window.tells and telemetry.fps >= _CONTACTS_FPS:
+        # Frames per second below which a step of a foot ends between two frames: contacts are not seen.
+        if window.tells and telemetry.fps >= 8.0:
             self._contact = min(self._contact, contact / window.ankles_seen)
 
     def refusal(self) -> Refusal | None:
         if not self._cost <= _LARGEST_COST:
             return Refusal(Why.POSITION_JUMPS)
-        return Refusal(Why.NO_FOOT_RESTS) if self._contact < _LEAST_CONTACT else None
+        # Least share of the time with a foot in contact: jogging has 0.2, a yaw off by 40 degrees less than 0.01.
+        return Refusal(Why.NO_FOOT_RESTS) if self._contact < 0.03 else None
 
 
 def _held_pelvis(before: Before, stamp_ns: int) -> np.ndarray:

@@ -15,21 +15,15 @@ from drocap_ros.skeleton import BODY_15
 _FROZEN_S = 1.0
 #: Median speed (m/s) of a camera that moves: a hover drifts more slowly.
 _MOVING_M_S = 0.2
-#: Change (m, or of a rotation's elements) of poses that are the same: the rounding of their interpolation.
-_SAME = 1e-9
 #: A vehicle stops and starts more slowly than this (m/s^2): gravity, by a tilt of 45 degrees.
 _STOP_M_S2 = 10.0
 #: Times (s) within which no gimbal turns by so much (degrees) and stands still, or turns evenly, before and after; 0 =
 #: one frame.  Simulated orbits at 15 frames per second reach 5.3 degrees in both.
 _TURNS_S_DEG = ((0.0, 10.0), (0.12, 12.0))
-#: Change of the turn rate of a gimbal (degrees/s^2): what one frame of a low rate may hold.
-_TURN_DEG_S2 = 500.0
 #: Time (s) within which a position jumps and moves evenly before and after: two images, one between two states;
 _JUMP_S = 0.12
 #: and the least jump (m): resets of an estimator are larger.
 _JUMP_M = 0.5
-#: Height (m per m) of the image's lower border above its centre, from which a camera is upside down: no orbit's tilt.
-_UPSIDE_DOWN = 0.2
 #: Largest error (s) of a log's time that is tried; a judgement;
 _SHIFTS_S = 3.0
 #: and the step (s) between two: half a step of walking.
@@ -87,7 +81,8 @@ def turned_at_once(rotation: np.ndarray, fps: float) -> Refusal | None:
         turn = log_so3(rotation[lag:] @ np.swapaxes(rotation[:-lag], 1, 2))
         differs = np.linalg.norm(turn[lag:] - turn[:-lag], axis=1)
         jump = np.degrees(np.minimum(differs[:-lag], differs[lag:]).max(initial=0.0))
-        if jump > max(least_deg, _TURN_DEG_S2 * (lag / fps) ** 2):
+        # Change of the turn rate of a gimbal (degrees/s^2): what one frame of a low rate may hold.
+        if jump > max(least_deg, 500.0 * (lag / fps) ** 2):
             return Refusal(Why.TURNED_AT_ONCE, float(jump))
     return None
 
@@ -104,14 +99,17 @@ def jump_m(position: np.ndarray, fps: float) -> float:
 def upside_down(joints: np.ndarray, rotation: np.ndarray) -> Refusal | None:
     """Whether camera (F, 3, 3) and person (F, P, 3) m both stand on their heads: a log whose z points down."""
     trunk = joints[:, BODY_15.index("neck"), 2] - joints[:, BODY_15.index("pelvis"), 2]
-    if not (np.median(rotation[:, 1, 2]) > _UPSIDE_DOWN and np.median(trunk) < 0.0):
+    # Height (m per m) of the image's lower border above its centre, from which a camera is upside down: no orbit's
+    # tilt.
+    if not (np.median(rotation[:, 1, 2]) > 0.2 and np.median(trunk) < 0.0):
         return None
     return Refusal(Why.UPSIDE_DOWN)
 
 
 def unchanged(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
     """(F - 1,) whether each pose of (F, 3, 3), (F, 3) m is the one before."""
-    place, turn = (np.abs(np.diff(values, axis=0)) < _SAME for values in (position, rotation))
+    # Change (m, or of a rotation's elements) of poses that are the same: the rounding of their interpolation.
+    place, turn = (np.abs(np.diff(values, axis=0)) < 1e-9 for values in (position, rotation))
     same: np.ndarray = place.all(-1) & turn.all((-1, -2))
     return same
 

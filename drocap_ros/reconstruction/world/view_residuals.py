@@ -28,8 +28,6 @@ OUTLIER_SQUARE = LiftedConfig.outlier_square
 #: The same over the median square, while all residuals are large: two standard deviations of the usual joint.
 _OVER_MEDIAN = 4.0
 _DEPTH_ROUNDING_M = DEPTH_ROUNDING_MM / 1000.0
-#: Weight of the lifter's depths, whose errors last, where further views measure them.
-_BESIDE_VIEWS = 0.1
 #: Least depth (m) of a joint before the camera: no drone is nearer.
 _NEAREST_M = 0.3
 #: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
@@ -37,8 +35,6 @@ _OWN_LATENCY = 0.2
 #: The shared unknowns of a camera, and their columns in its derivatives: a misalignment turns every frame.
 OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY, LENS, LEAN]
 CAMERA_COLUMNS = np.array([6, 3, 4, 5, 7, 8, 9, 10, 11])
-#: Deviation of the logarithm of a focal length that is known, and of a lean (rad) that is none.
-_KNOWN = 1e-6
 
 
 class ViewWeights(NamedTuple):
@@ -65,9 +61,10 @@ def view_weights(view: WorldInput, alone: bool) -> ViewWeights:
     first = fact * first
     if view.doubt.placed_m:  # a camera that was placed by the body errs by its placement
         first[:3] = fact / (fact / first[:3] + view.doubt.placed_m**2)
+    # Weight of the lifter's depths, whose errors last, where further views measure them.
     return ViewWeights(
         acceleration=(errors.acceleration_m_s2 / fps**2) ** -2,
-        depth=(1.0 if alone else _BESIDE_VIEWS) / np.maximum(view.depth_sigma, 0.01),
+        depth=(1.0 if alone else 0.1) / np.maximum(view.depth_sigma, 0.01),
         wander=fact * wander,
         first=first,
     )
@@ -82,7 +79,8 @@ def errors_precision(view: WorldInput) -> np.ndarray:
     precision[:3, :3] = axes.T @ np.diag(turned**-2) @ axes
     own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
     precision[3:5, 3:5] = np.linalg.inv(errors.latency_s**2 * own)
-    precision[5:, 5:] = np.diag(np.maximum([doubt.lens[1], doubt.lean_std, doubt.lean_std], _KNOWN) ** -2)
+    # Deviation of the logarithm of a focal length that is known, and of a lean (rad) that is none.
+    precision[5:, 5:] = np.diag(np.maximum([doubt.lens[1], doubt.lean_std, doubt.lean_std], 1e-6) ** -2)
     return precision
 
 

@@ -33,20 +33,12 @@ from drocap_ros.reconstruction.world.world_model import (
 from drocap_ros.reconstruction.world.world_residuals import Contacts, WorldResiduals, weights_of
 
 
-class Posterior(NamedTuple):
-    """Covariances at a unit variance of every residual.
+def posterior(equations: Equations, state: WorldState) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Covariances at a unit variance of every residual, from the equations at the solution; None = not definite.
 
-    place : (3, 3) m^2 of the mean place of all joints of all frames, in the world
-    joints : (F, 17, 3, 3) m^2 about it; shared : of the shared unknowns
+    That is of the mean place of all joints of all frames in the world, (3, 3) m^2, of the joints about it,
+    (F, 17, 3, 3) m^2, and of the shared unknowns.
     """
-
-    place: np.ndarray
-    joints: np.ndarray
-    shared: np.ndarray
-
-
-def posterior(equations: Equations, state: WorldState) -> Posterior | None:
-    """Covariances from the equations at the solution; None = not positive definite."""
     found = Covariances.of(equations)
     if found is None:
         return None
@@ -67,23 +59,15 @@ def posterior(equations: Equations, state: WorldState) -> Posterior | None:
     own = found.of_frames(mean.reshape(-1, 3)).reshape(mean.shape)[:, cameras:] / scale
     with_place = own.reshape(frames, JOINTS, 3, 3) + lever @ (found.shared @ lever.mean(axis=(0, 1)).T)
     place = with_place.mean(axis=(0, 1))
-    return Posterior(place, joints - with_place - np.swapaxes(with_place, -1, -2) + place, found.shared)
+    return place, joints - with_place - np.swapaxes(with_place, -1, -2) + place, found.shared
 
 
-#: Relative decrease of the cost below which the adjustment has converged.
-_CONVERGED = 1e-4
 #: Standard deviation (m/s) of the speed of feet in contact, step by step: at first the body slides; the last one stays.
 _CONTACT_SPEEDS_M_S = (0.6, 0.4, 0.3, 0.2, 0.15)
 #: Spread (m) of the heights of resting feet on level ground, as the body's errors leave it,
 _LEVEL_M = 0.025
 #: and on steps, a third of a stair's riser.
 _STEPS_M = 0.06
-#: Height (m) at which a foot counts a quarter as one on the ground.
-_ABOVE_M = 0.3
-#: Scale below which a step of the adjustment goes astray: no person measures five times the assumed stature.
-_LEAST_SCALE = 0.2
-#: Weight of a held unknown, per m^2 or rad^2: a hundred thousand times that of a clear keypoint.
-_HOLD = 1e10
 #: Errors of the shared unknowns over their formal standard deviations, from the scale errors of 36 runs: contacts are
 #: chosen by the same data.
 _STD_FACTOR = 1.25
@@ -187,7 +171,8 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
             stop = NO_DESCENT
             break
         state, outlier = there.state, there.usual_outlier()
-        if stage.locking and here.cost - there.cost <= _CONVERGED * here.cost:
+        # Relative decrease of the cost below which the adjustment has converged.
+        if stage.locking and here.cost - there.cost <= 1e-4 * here.cost:
             stop = CONVERGED
             break
     final = WorldResiduals(data, weights, state, Contacts(contact, config.contact_weight, near, floor_std=floor_std))
@@ -203,11 +188,13 @@ def _still(data: WorldInput) -> np.ndarray | None:
 def _improved(here: WorldResiduals, held: int, locking: bool) -> WorldResiduals | None:
     """The point after one step of Gauss-Newton, shortened until the cost falls; None = there is none."""
     equations = here.equations()
-    equations.band[: held * joint_columns(len(here.views)).stop, 0] += _HOLD
+    # Weight of a held unknown, per m^2 or rad^2: a hundred thousand times that of a clear keypoint.
+    equations.band[: held * joint_columns(len(here.views)).stop, 0] += 1e10
 
     def moved(frames: np.ndarray, shared: np.ndarray) -> WorldResiduals | None:
         there = here.moved(frames, shared)
-        return there if there.state.globals[SCALE] > _LEAST_SCALE else None
+        # Scale below which a step of the adjustment goes astray: no person measures five times the assumed stature.
+        return there if there.state.globals[SCALE] > 0.2 else None
 
     return descend(here, equations, moved, locking)
 
@@ -226,9 +213,9 @@ def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason
     findings = Findings.unknown()
     if found is not None:
         widest = np.sqrt(fact * np.diag(np.linalg.inv(prior)))
-        shared = found.shared[:GLOBALS, :GLOBALS]
+        place, covariance = fact * found[0], fact * found[1]
+        shared = found[2][:GLOBALS, :GLOBALS]
         std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(shared)), widest)
-        place, covariance = fact * found.place, fact * found.joints
         turns = _STD_FACTOR**2 * fact * axes @ shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
         least = fact * axes @ np.linalg.inv(prior[MISALIGNMENT, MISALIGNMENT]) @ axes.T
         turned_std = np.sqrt(np.minimum(np.diag(turns), np.diag(least)))
@@ -278,7 +265,8 @@ def _near_ground(state: WorldState, ground_m: float) -> np.ndarray:
     if not ground_m:
         return near
     rows, lower = np.arange(len(near)), height[:, : len(ANKLES)].argmin(axis=1)
-    near[rows, lower] = 1.0 / (ground_m * (1.0 + np.square(height[rows, lower] / _ABOVE_M))) ** 2
+    # Height (m) at which a foot counts a quarter as one on the ground.
+    near[rows, lower] = 1.0 / (ground_m * (1.0 + np.square(height[rows, lower] / 0.3))) ** 2
     return near
 
 

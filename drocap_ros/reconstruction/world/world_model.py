@@ -23,8 +23,6 @@ GROUND_M = 0.15
 SIZE_STD = 0.04
 #: Relative standard deviation of the scale below which it counts as measured: half of that among people.
 MEASURED = 0.03
-#: Time (s) after which findings count a third: telemetry drifts, and errors of the poses do not average out.
-_MEMORY_S = 60.0
 
 
 class Findings(NamedTuple):
@@ -44,7 +42,8 @@ class Findings(NamedTuple):
 
     def later(self, found: Findings, share: float, passed_s: float) -> Findings:
         """Findings ``passed_s`` later, with a share of those of a window: its frames that the next one has not."""
-        decay = float(np.exp(-passed_s / _MEMORY_S))
+        # Time (s) after which findings count a third: telemetry drifts, and errors of the poses do not average out.
+        decay = float(np.exp(-passed_s / 60.0))
         return Findings(
             decay * (self.precision + share * found.precision), decay * (self.vector + share * found.vector)
         )

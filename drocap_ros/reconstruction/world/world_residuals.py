@@ -54,11 +54,6 @@ from drocap_ros.reconstruction.world.world_model import (
     shared_columns,
 )
 
-#: Square (m^2) below which a bone has no direction: a hundredth of a millimetre.
-_LEAST_SQUARE_M2 = 1e-10
-#: Standard deviation (m) of the floor's height where no foot is in contact: any height.
-_ANY_FLOOR_M = 1000.0
-
 
 class WorldWeights(NamedTuple):
     """Weights of one adjustment that do not depend on the unknowns; the names are those of the terms.
@@ -79,7 +74,8 @@ def weights_of(data: WorldInput) -> WorldWeights:
     config, size = data.config, GLOBALS + OWN * len(data.further)
     shared, expected = np.zeros((size, size)), np.zeros(size)
     shared[LENGTHS, LENGTHS] = np.diag((config.length_std * data.lengths) ** -2)
-    shared[FLOOR, FLOOR] = (config.ground_m or _ANY_FLOOR_M) ** -2
+    # Standard deviation (m) of the floor's height where no foot is in contact: any height.
+    shared[FLOOR, FLOOR] = (config.ground_m or 1000.0) ** -2
     expected[FLOOR] = ANKLE_M if config.ground_m else 0.0
     shared[SCALE, SCALE] = config.stature_std**-2
     for number, view in enumerate(data.views):
@@ -133,7 +129,8 @@ class WorldResiduals:
         """Bones with their lengths, and joints with a steady motion."""
         joints, lengths = self.state.joints, self.state.globals[LENGTHS]
         span = joints[:, SPANS[:, 1]] - joints[:, SPANS[:, 0]]
-        length = np.sqrt(np.square(span).sum(-1) + _LEAST_SQUARE_M2)
+        # Square (m^2) below which a bone has no direction: a hundredth of a millimetre.
+        length = np.sqrt(np.square(span).sum(-1) + 1e-10)
         self.direction = span / length[..., None]
         self.stretch = (length - lengths) / SPAN_STD_M
         self.excess = 1.0 - lengths / length

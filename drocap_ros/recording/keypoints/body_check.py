@@ -46,8 +46,6 @@ _STANDING = np.array(
 _HEADS = ("nose", "head", "head_top", "left_eye", "right_eye", "left_ear", "right_ear", "crown")
 #: Statures that are tried, as multiples of the points' deviation from their middle.
 _UNITS = np.geomspace(1.0, 12.0, 32)
-#: Frames that are looked at, even steps of all.
-_LOOKED_AT = 32
 #: Degrees of freedom of the bones' distribution: few, so that a bad point counts little.
 _FREEDOM = 3.0
 #: Points of the twelve limbs and the head without which a frame tells nothing.
@@ -133,7 +131,8 @@ def _limb_points(xy: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.n
     places = limbs_of(names)
     seen = np.isfinite(xy[:, list(places.values())]).all(axis=2).sum(axis=1) if places else np.zeros(len(xy), int)
     frames = xy[seen >= _LEAST_SEEN]
-    frames = frames[:: max(1, len(frames) // _LOOKED_AT)]
+    # Frames that are looked at, even steps of all.
+    frames = frames[:: max(1, len(frames) // 32)]
     joints = np.full((len(frames), len(_PLACES), 2), np.nan)
     for joint, at in places.items():
         joints[:, _PLACES.index(joint)] = frames[:, at]

@@ -258,13 +258,6 @@ _USUAL_HZ = 30.0
 #: Coordinates that are all within the first are shares of the picture.  Scores beyond the second are no shares of one:
 #: some networks exceed 1 a little, and COCO's flags end there.
 _LARGEST_SHARE, _HIGHEST_SCORE = 2.0, 2.0
-#: Share of coordinates below zero from which they are about a middle, where half are: of a person whose head is above
-#: the picture every sixth is.
-_MOST_BELOW = 0.3
-#: No network sees a person of fewer px.
-_SMALLEST_PX = 6.0
-#: Frames so many times as far apart as they are many are no video's.
-_SPARSE = 10
 
 
 def is_keypoint_file(path: Path) -> bool:
@@ -389,7 +382,9 @@ def _pixels(xy: np.ndarray, size: tuple[int, int] | None, spatial: bool) -> np.n
     low, high = float(np.nanmin(xy)), float(np.nanmax(xy))
     below = (xy[np.isfinite(xy).all(axis=2)] < 0).mean(axis=0)
     # Of two coordinates in px along each axis: who is cut off is so at one side.
-    if (below.mean() if spatial or high <= _LARGEST_SHARE else below.min()) > _MOST_BELOW:
+    # Share of coordinates below zero from which they are about a middle, where half are: of a person whose head is
+    # above the picture every sixth is.
+    if (below.mean() if spatial or high <= _LARGEST_SHARE else below.min()) > 0.3:
         raise InputError(
             f"expected px of the whole picture, found coordinates from {low:.4g} to {high:.4g}{hint}, about a middle;"
             " convert them to px, x right and y down from the picture's corner; of 3D poses take their 2D keypoints"
@@ -400,7 +395,8 @@ def _pixels(xy: np.ndarray, size: tuple[int, int] | None, spatial: bool) -> np.n
         return xy * size
     seen = xy[np.isfinite(xy).any(axis=(1, 2))]
     extent = float(np.median(np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1), axis=0).max())
-    if extent < _SMALLEST_PX:
+    # No network sees a person of fewer px.
+    if extent < 6.0:
         raise InputError(f"expected px, found a person of {extent:.3g}{hint}, as in metres; convert them to px")
     return xy
 
@@ -430,6 +426,7 @@ def _by_time(path: Path, content: Content, count: int) -> tuple[np.ndarray, list
     people = [(numbers[labels[f]], who, p) for f, who, p in content.people if len(p) == count and labels[f] in numbers]
     frames = np.unique(list(numbers.values()))
     step = np.gcd.reduce(np.diff(frames)) if len(frames) > 1 else 1
-    if (frames[-1] - frames[0]) // step < min(_SPARSE * len(frames), MAX_FRAMES):
+    # Frames so many times as far apart as they are many are no video's.
+    if (frames[-1] - frames[0]) // step < min(10 * len(frames), MAX_FRAMES):
         frames = np.arange(frames[0], frames[-1] + 1, step)
     return frames, people

@@ -13,8 +13,6 @@ from drocap_ros.errors import InputError
 
 #: A frame's name or number, or a person's; None = not stated.
 Label = str | int | float | None
-#: Digits of a frame's number; longer ones are times or sums.
-_LONGEST_NUMBER = 10
 #: Seconds of a unit by the end of a time's name; without one the first that gives a video's rate.
 _UNITS = {"_s": 1.0, "_ms": 1e-3, "_us": 1e-6, "_ns": 1e-9}
 _RATES_HZ = (2.0, 1000.0)
@@ -75,7 +73,8 @@ def numbers_of(labels: list[Label]) -> dict[Label, int]:
     """Number of each frame: the last one in its name where that tells frames apart, else its place."""
     names = list(dict.fromkeys(labels))
     found = [re.findall(r"\d+", Path(n).stem if isinstance(n, str) else str(n))[-1:] for n in names]
-    numbers = [int(digits[0]) for digits in found if digits and len(digits[0]) < _LONGEST_NUMBER]
+    # Digits of a frame's number; longer ones are times or sums.
+    numbers = [int(digits[0]) for digits in found if digits and len(digits[0]) < 10]
     return dict(zip(names, numbers if len(set(numbers)) == len(names) else range(len(names)), strict=True))
 
 

@@ -106,8 +106,6 @@ def order_named(text: str, count: int) -> str:
     return found[0]
 
 
-#: Limb joints among stated names from which these are a body's.
-_LEAST_LIMBS = 4
 #: Least lead of the likelihood over that of another order, and of the points upside down.
 _LEAD, _UPSIDE_LEAD = 0.25, 0.5
 
@@ -121,7 +119,8 @@ def name_points(xy: np.ndarray, stated: Sequence[str], wanted: str | None, tool:
     count = xy.shape[1]
     if wanted is not None:
         return ORDERS[order_named(wanted, count)], ""
-    if len(stated) == count and len(limbs_of(names := names_of(stated))) >= _LEAST_LIMBS:
+    # Limb joints among stated names from which these are a body's.
+    if len(stated) == count and len(limbs_of(names := names_of(stated))) >= 4:
         return names, ""
     known = [name for name in orders_of(count) if name.startswith(tool)] or orders_of(count)
     if not known:

@@ -94,8 +94,6 @@ Yaml = dict[str, object]
 METADATA_FILE = "metadata.yaml"
 #: Name of the metadata records that this package writes into MCAP files.
 METADATA_RECORD = "drocap_ros"
-#: Version of the file that ROS 2 Jazzy writes.
-_VERSION = 9
 #: rosbag2's duration without an end: the most nanoseconds of an int64.
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
@@ -158,9 +156,10 @@ def bag_metadata(files: list[FileRecord], topics: list[TopicRecord], custom: dic
     """Content of the file: storage files, topics and times."""
     starts = [f.start_ns for f in files if f.start_ns is not None]
     start_ns = min(starts, default=None)
+    # Version of the file that ROS 2 Jazzy writes.
     return {
         "rosbag2_bagfile_information": {
-            "version": _VERSION,
+            "version": 9,
             "storage_identifier": "mcap",
             **_time(start_ns, max((f.end_ns for f in files), default=0)),
             "message_count": sum(f.messages for f in files),

@@ -30,11 +30,8 @@ MAGIC = b"\x89MCAP0\r\n"
 #: Largest chunk that is unpacked, and how much larger than packed one may be, beyond a size that is harmless anyway.
 _MAX_CHUNK = 512 << 20
 _FREE_EXPANSION = 64 << 20  # bytes
-_MAX_EXPANSION = 1000  # times; a judgement: what is packed more and is large is no recording
 #: Bytes searched at once for the next chunk.
 _SEARCH = 1 << 20
-#: MCAP's code of a chunk, https://mcap.dev/spec.
-_CHUNK_OPCODE = 6
 #: opcode, length, start and end time, unpacked size, checksum, length of the compression's name
 _CHUNK_HEAD = struct.Struct("<BQQQQII")
 _COMPRESSION = re.compile(rb"\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4")
@@ -299,7 +296,8 @@ def _next_chunk(file: IO[bytes], start: int, stop: int) -> int | None:
         data = file.read(min(_SEARCH, stop - place) + overlap)
         for match in _COMPRESSION.finditer(data):
             at = match.start() - _CHUNK_HEAD.size + 4
-            if at < 0 or place + at >= stop or data[at] != _CHUNK_OPCODE:
+            # MCAP's code of a chunk, https://mcap.dev/spec.
+            if at < 0 or place + at >= stop or data[at] != 6:
                 continue
             _, length, begin, end, unpacked, _, _ = _CHUNK_HEAD.unpack_from(data, at)
             if place + at + 9 + length <= size and begin <= end and unpacked <= _MAX_CHUNK:
@@ -331,7 +329,8 @@ def _ros2_name(name: str) -> str:
 def _unpacked(chunk: Chunk) -> Chunk:
     """The chunk with its records uncompressed; implausible sizes raise."""
     size = chunk.uncompressed_size
-    if size > _MAX_CHUNK or size > max(_FREE_EXPANSION, _MAX_EXPANSION * len(chunk.data)):
+    # What is packed more and is large is no recording; a judgement.
+    if size > _MAX_CHUNK or size > max(_FREE_EXPANSION, 1000 * len(chunk.data)):
         raise ValueError("chunk too large")
     if chunk.compression == "zstd":
         import zstandard

@@ -15,6 +15,7 @@ from drocap_ros.errors import InputError, first_line
 from drocap_ros.flight.vehicle import orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import (
+    FIX_3D,
     Lack,
     LogFormat,
     LogLack,
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
     from pymavlink.DFReader import DFMessage
 
-#: UTC in s from which a time is one of a GPS (2001); before its first fix the reader counts from 1970.
-_EARLIEST_UTC_S = 1e9
 #: message -> fields used
 _FIELDS = {
     "ATT": ("Roll", "Pitch", "Yaw"),
@@ -39,11 +38,9 @@ _FIELDS = {
     "GPS": ("Lat", "Lng", "Alt", "Status"),
     "MNT": ("Roll", "Pitch", "YawE", "YawB", "I"),
 }
-_FIX_3D = 3  # status of a GPS with a fix in three dimensions; more are better ones
 _PARAMETER = "PARM"
 #: ArduPilot's parameter for the kind of a mount, by its number from 1 on; of the first one also without a number.
 _MOUNT_TYPE = re.compile(r"MNT(\d?)_TYPE")
-_SERVOS = 1  # of that parameter
 #: ... for the mount of the first camera, from 1 on; 0 = the first.
 _CAMERA_MOUNT = "CAM1_MNT_INST"
 
@@ -90,14 +87,16 @@ class _Content:
     def take(self, message: DFMessage) -> None:
         name = message.get_type()
         if name == _PARAMETER:
-            if (mount := _MOUNT_TYPE.fullmatch(message.Name)) and message.Value == _SERVOS:
+            # The kind 1 is servos.
+            if (mount := _MOUNT_TYPE.fullmatch(message.Name)) and message.Value == 1:
                 self.servos.add(int(mount[1] or 1))
             elif message.Name == _CAMERA_MOUNT:
                 self.camera_mount = int(message.Value)
             return
         values = (float(getattr(message, field, np.nan)) for field in _FIELDS[name])
         self.rows[name].append((float(message.TimeUS), *values))
-        if name == "ATT" and message._timestamp > _EARLIEST_UTC_S:
+        # UTC in s from which a time is one of a GPS (2001); before its first fix the reader counts from 1970.
+        if name == "ATT" and message._timestamp > 1e9:
             self.utc_us.append(message._timestamp * 1e6 - message.TimeUS)
 
     def series(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +111,7 @@ def _position(content: _Content, stamp_ns: np.ndarray) -> tuple[np.ndarray | Non
         if not content.rows[name]:
             continue
         known_ns, geodetic = content.series(name)
-        lost = (geodetic[:, :2] == 0).all(axis=1) | (geodetic[:, 3:] < _FIX_3D).any(axis=1)
+        lost = (geodetic[:, :2] == 0).all(axis=1) | (geodetic[:, 3:] < FIX_3D).any(axis=1)
         geodetic[lost] = np.nan
         if (enu := from_first_fix(geodetic[:, :3])) is not None:
             return at_stamps(known_ns, enu, stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, name)]

@@ -37,19 +37,14 @@ from drocap_ros.tracks import MAX_FRAMES
 _FORMAT = "djmd"
 #: Bytes of a message; known ones have some kilobytes.
 _MAX_MESSAGE = 1 << 18
-_MIN_MESSAGE = 4  # bytes: a field's key, its length and a message of one value
 #: Messages from which the layout is found.
 _PROBED = 32
 _FIRST = 4  # the header stands in one of these
 #: Units of the file: angles in tenths of a degree, heights in mm; ExifTool's DJI tags.
 _TENTH_DEG = 0.1
 _MM = 1e-3  # m; of the file's heights
-#: Largest angle between the gimbal's quaternion and its angles, deg: five times their rounding to 0.1 deg.
-_AGREEMENT_DEG = 0.5
 #: Digital zooms; others are another value at that place.
 _ZOOM_RANGE = (1.0, 60.0)
-#: Of an unknown schema: largest median roll of a gimbal, deg, which keeps the camera level.
-_ROLL_DEG = 45.0
 #: Of an unknown schema: largest median turn of the gimbal from the nose, deg, whose yaw follows the aircraft's.
 _TURN_DEG = 90.0
 #: Ends of the columns of one message's numbers: gimbal 3, aircraft 3, quaternion 4, latitude, longitude, unit, two
@@ -90,7 +85,8 @@ def _samples(path: Path, number: int) -> Iterator[tuple[int, bytes]]:
     last_ns = -1
     for stamp_ns, data in itertools.islice(read_samples(path, number), MAX_FRAMES):
         count += 1
-        if _MIN_MESSAGE <= len(data) <= _MAX_MESSAGE and stamp_ns > last_ns:
+        # Four bytes are a field's key, its length and a message of one value.
+        if 4 <= len(data) <= _MAX_MESSAGE and stamp_ns > last_ns:
             fit, last_ns = fit + 1, stamp_ns
             yield stamp_ns, data
     if fit < 0.5 * count or not fit:
@@ -213,7 +209,8 @@ def _check_unknown(path: Path, series: Series) -> None:
     roll = np.nanmedian(np.abs(series.gimbal[:, 1])) if np.isfinite(series.gimbal).any() else 0.0
     turn = np.abs((series.gimbal[:, 2] - series.aircraft[:, 2] + 180.0) % 360.0 - 180.0)
     away = np.nanmedian(turn) if np.isfinite(turn).any() else 0.0
-    if roll > _ROLL_DEG or away > _TURN_DEG:
+    # A gimbal keeps the camera level: a larger median roll, deg, is another field.
+    if roll > 45.0 or away > _TURN_DEG:
         raise InputError(
             f"{path}: expected a level gimbal that follows the aircraft at the places of known djmd schemas, found a"
             f" roll of {roll:.0f} deg and a turn of {away:.0f} deg; give a log beside the video with --telemetry"
@@ -241,7 +238,8 @@ def _with_quaternion(attitude: np.ndarray, quaternion: np.ndarray) -> tuple[np.n
     for order in ([1, 2, 3, 0], [0, 1, 2, 3]):  # w x y z; x y z w
         finer = orientation_to_ros(unit_quaternions(quaternion[given][:, order]))
         cosine = np.clip(np.abs(np.sum(finer * attitude[given], axis=1)), 0.0, 1.0)
-        if np.percentile(np.rad2deg(2 * np.arccos(cosine)), 95) < _AGREEMENT_DEG:
+        # Largest angle between the gimbal's quaternion and its angles, deg: five times their rounding to 0.1 deg.
+        if np.percentile(np.rad2deg(2 * np.arccos(cosine)), 95) < 0.5:
             attitude = attitude.copy()
             attitude[given] = finer
             return attitude, True

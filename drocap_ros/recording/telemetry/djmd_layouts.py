@@ -95,8 +95,6 @@ SCHEMA: Path = (1, 1, 1)
 UNIT = 1
 LATITUDE = 2  # number of its field
 LONGITUDE = 3  # number of its field
-#: Highest field number at which a position is searched; the known ones are below 6.
-_SEARCHED = 12
 
 
 class Layout(NamedTuple):
@@ -178,7 +176,8 @@ def _positions(message: Message, layout: Layout | None) -> Iterator[Path]:
     places = [one.position for one in ((layout,) if layout else (WITH_GIMBAL, WITHOUT_GIMBAL))]
     for parent in ((3, 3, 4), (3, 4)):
         places.append(parent)
-        for child in range(1, _SEARCHED + 1):
+        # Highest field number at which a position is searched; the known ones are below 6.
+        for child in range(1, 13):
             places += [(*parent, child), (*parent, child, 1)]
     for place in places:
         fields = message.fields(place)

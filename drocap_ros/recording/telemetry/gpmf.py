@@ -11,12 +11,12 @@ import datetime
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.telemetry.log import (
+    FIX_3D,
     Lack,
     LogLack,
     Series,
@@ -33,57 +33,48 @@ CODE = "gpmd"
 #: Types of numbers and their codes of ``struct``.
 _CODES = {"b": "b", "B": "B", "s": "h", "S": "H", "l": "i", "L": "I", "f": "f", "d": "d", "j": "q", "J": "Q"}
 _DEEPEST = 4
-_FIX_3D = 3
-#: Seconds of a sample where no later one shows them.
-_SAMPLE_S = 1.0
-
-
-class _Fixes(NamedTuple):
-    """Of one sample: (N, 3) latitude, longitude deg and height m; UTC of the first, s, or None."""
-
-    place: np.ndarray
-    utc_s: float | None
 
 
 def read_gpmf(path: Path, number: int) -> TelemetryLog:
     """Positions (GPS9, else GPS5) by the video's clock; those of a sample are even in time."""
-    stamps, fixes = list[int](), list[_Fixes]()
+    stamps, places, starts = list[int](), list[np.ndarray](), list[float]()
     for stamp_ns, data in read_samples(path, number):
+        fixes, utc_s = _fixes(data)
         stamps.append(stamp_ns)
-        fixes.append(_fixes(data))
-    counts = [len(each.place) for each in fixes]
+        places.append(fixes)
+        starts += [] if utc_s is None else [utc_s * 1e9 - stamp_ns]
+    counts = [len(fixes) for fixes in places]
     if not 0 < sum(counts) <= MAX_FRAMES:
         raise InputError(f"{path}: expected positions in the GoPro track, found none; was GPS on? give a log beside it")
-    ends = [*stamps[1:], stamps[-1] + round(_SAMPLE_S * 1e9)]
+    # Seconds of a sample where no later one shows them.
+    ends = [*stamps[1:], stamps[-1] + 10**9]
     at = [start + (end - start) * np.arange(n) // max(n, 1) for start, end, n in zip(stamps, ends, counts, strict=True)]
-    stamp_ns, place = np.concatenate(at).astype(np.int64), np.concatenate([each.place for each in fixes])
-    unknown = np.full((len(place), 3), np.nan)
-    found, lacks = plausible(path, Series(stamp_ns, unknown, unknown, place))
+    stamp_ns, place = np.concatenate(at).astype(np.int64), np.concatenate(places)
+    found, lacks = plausible(path, Series.of_places(stamp_ns, place))
     lacks.append(LogLack(Lack.HEIGHT, "height above the sea"))
     log = make_log(path, "GoPro GPMF track", stamp_ns, lacks, position=from_first_fix(found.geodetic))
-    utc = [each.utc_s * 1e9 - at_ns for each, at_ns in zip(fixes, stamps, strict=True) if each.utc_s is not None]
-    return log._replace(video_clock=True, utc_minus_stamp_ns=round(float(np.median(utc))) if utc else None)
+    return log._replace(video_clock=True, utc_minus_stamp_ns=round(float(np.median(starts))) if starts else None)
 
 
-def _fixes(data: bytes) -> _Fixes:
-    """Fixes of a sample: of its stream with GPS9, else with GPS5."""
-    older = _Fixes(np.zeros((0, 3)), None)
+def _fixes(data: bytes) -> tuple[np.ndarray, float | None]:
+    """Latitude, longitude deg and height m (N, 3) of a sample, by GPS9, else GPS5; UTC of the first, s, or None."""
+    older: tuple[np.ndarray, float | None] = np.zeros((0, 3)), None
     for stream in _streams(data, 0):
         scale = np.array(_numbers(*stream["SCAL"]) if "SCAL" in stream else [1.0], np.float64)
         if "GPS9" in stream and len(scale) == 9:
             kind, content = stream["GPS9"]
             form = struct.Struct(">lllllllHH" if kind == "?" else f">9{_CODES.get(kind, 'i')}")
             rows = _rows(form.iter_unpack(content[: len(content) // form.size * form.size]), scale)
-            rows[rows[:, 8] < _FIX_3D, :3] = np.nan
+            rows[rows[:, 8] < FIX_3D, :3] = np.nan
             known = rows[np.isfinite(rows[:, 0])]
             since_2000 = 946_684_800.0
-            return _Fixes(rows[:, :3], since_2000 + 86_400 * known[0, 5] + known[0, 6] if len(known) else None)
+            return rows[:, :3], since_2000 + 86_400 * known[0, 5] + known[0, 6] if len(known) else None
         if "GPS5" in stream and len(scale) == 5:
             values = _numbers(*stream["GPS5"])
             rows = _rows(values[: len(values) // 5 * 5], scale)
-            fix = (_numbers(*stream["GPSF"]) or [0])[0] if "GPSF" in stream else _FIX_3D
-            rows[:, :3] = rows[:, :3] if fix >= _FIX_3D else np.nan
-            older = _Fixes(rows[:, :3], _utc_s(stream.get("GPSU", ("", b""))[1]))
+            fix = (_numbers(*stream["GPSF"]) or [0])[0] if "GPSF" in stream else FIX_3D
+            rows[:, :3] = rows[:, :3] if fix >= FIX_3D else np.nan
+            older = rows[:, :3], _utc_s(stream.get("GPSU", ("", b""))[1])
     return older
 
 

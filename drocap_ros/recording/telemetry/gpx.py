@@ -6,7 +6,7 @@ import datetime
 import math
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 from xml.etree.ElementTree import ParseError, iterparse
 
 import numpy as np
@@ -29,11 +29,8 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 
-class _Point(NamedTuple):
-    """Time UTC ns; latitude, longitude deg and height m, NaN unknown."""
-
-    stamp_ns: int
-    place: tuple[float, float, float]
+#: Time UTC ns; latitude, longitude deg and height m, NaN unknown.
+_Point = tuple[int, tuple[float, float, float]]
 
 
 def read_gpx(path: Path, *, track: str = "") -> TelemetryLog:
@@ -43,7 +40,7 @@ def read_gpx(path: Path, *, track: str = "") -> TelemetryLog:
         raise InputError(f"{path}: expected points with times in a GPX track, found none; export it with times")
     number, lacks = choose(path, "track", {str(n): len(points) for n, points in tracks.items()}, track)
     points = tracks[int(number)]
-    stamp_ns, place = np.array([p.stamp_ns for p in points]), np.array([p.place for p in points])
+    stamp_ns, place = (np.array(column) for column in zip(*points, strict=True))
     order = np.unique(stamp_ns, return_index=True)[1]
     stamp_ns, place = stamp_ns[order], place[order]
     if damaged:
@@ -51,8 +48,7 @@ def read_gpx(path: Path, *, track: str = "") -> TelemetryLog:
     if np.isnan(place[:, 2]).all():
         place[:, 2] = 0.0
         lacks.append(LogLack(Lack.HEIGHT_UNKNOWN))
-    unknown = np.full((len(place), 3), np.nan)
-    found, more = plausible(path, Series(stamp_ns, unknown, unknown, place))
+    found, more = plausible(path, Series.of_places(stamp_ns, place))
     lacks += [*more, LogLack(Lack.LOCAL_POSITION, "point")]
     log = make_log(path, "GPX track", stamp_ns, lacks, position=from_first_fix(found.geodetic))
     return log._replace(utc_minus_stamp_ns=0)
@@ -92,7 +88,7 @@ def _point(element: Element) -> _Point | None:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=datetime.timezone.utc)
     since = time - datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
-    return _Point(round(since / datetime.timedelta(microseconds=1)) * 1000, place) if math.isfinite(place[0]) else None
+    return (round(since / datetime.timedelta(microseconds=1)) * 1000, place) if math.isfinite(place[0]) else None
 
 
 FORMAT = LogFormat(".gpx", read_gpx, chooses=("track",))

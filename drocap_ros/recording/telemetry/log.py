@@ -18,6 +18,8 @@ from drocap_ros.geometry.interpolation import interpolate, true_runs, without_st
 from drocap_ros.geometry.rotations import quaternion_multiply, unit_quaternions
 from drocap_ros.tracks import Tracks
 
+#: Kind of a receiver's fix in three dimensions, by PX4, ArduPilot and GoPro; more are better ones.
+FIX_3D = 3
 #: Interpolation over longer gaps than this is reported.
 REPORTED_GAP_S = 1.0
 #: Share of the images that must have a pose; with fewer the telemetry is left out, not the images.
@@ -128,10 +130,6 @@ def _series(
     return found, known, words
 
 
-#: Longest gap of one series of a log over which it is interpolated: ten periods of the slowest usual rate, 10 Hz.
-_SERIES_GAP_S = 1.0
-
-
 def dji_attitude(pitch_roll_yaw_deg: np.ndarray) -> np.ndarray:
     """(N, 4) x y z w FLU -> ENU of DJI's angles (N, 3): pitch positive up, yaw clockwise from north."""
     pitch, roll, yaw = np.deg2rad(pitch_roll_yaw_deg).T
@@ -157,27 +155,20 @@ def at_stamps(known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, *,
     order = np.argsort(known_ns, kind="stable")
     known_ns, values = known_ns[order], np.asarray(values, np.float64)[order]
     fresh = np.concatenate([[True], np.diff(known_ns) > 0])
-    found, _ = interpolate(known_ns[fresh], values[fresh], stamp_ns, spherical=spherical, max_gap_s=_SERIES_GAP_S)
+    # Longest gap of one series of a log over which it is interpolated: ten periods of the slowest usual rate, 10 Hz.
+    found, _ = interpolate(known_ns[fresh], values[fresh], stamp_ns, spherical=spherical, max_gap_s=1.0)
     return found
 
 
 #: Largest magnitudes of pitch, roll and yaw, deg.
 _LIMITS_DEG = np.array([180.0, 180.0, 360.0])
-#: Height, m, that no drone reaches.
-_MAX_HEIGHT_M = 20_000.0
-#: Largest share of states out of range that counts as damage, not as another meaning.
-_DAMAGED_SHARE = 0.02
 #: A turn, or a way, from one state to the next that no gimbal or drone makes.
 _TURN_DEG = 30.0
 _TURN_DEG_S = 360.0  # deg/s: twice what DJI's gimbals are specified to turn
 _STEP_M = 20.0  # m: a fix that is renewed moves a place by some metres
 _SPEED_M_S = 60.0  # m/s: beyond DJI's fastest drones, some 40 m/s
-#: Largest share of such turns: angles jump where a gimbal is recentred.
-_TURNS_SHARE = 0.05
 #: Metres of a degree of latitude.
 _METRES_PER_DEG = 111_320.0
-#: States from which zeros throughout mean that nothing was filled in.
-_LEAST_STATES = 10
 
 
 class Series(NamedTuple):
@@ -193,6 +184,12 @@ class Series(NamedTuple):
     aircraft: np.ndarray
     geodetic: np.ndarray
 
+    @staticmethod
+    def of_places(stamp_ns: np.ndarray, geodetic: np.ndarray) -> Series:
+        """Those of a file without attitudes."""
+        unknown = np.full((len(geodetic), 3), np.nan)
+        return Series(stamp_ns, unknown, unknown, geodetic)
+
 
 def plausible(path: Path, series: Series) -> tuple[Series, list[LogLack]]:
     """The series without damaged states and places without a fix, and what was left out."""
@@ -200,12 +197,14 @@ def plausible(path: Path, series: Series) -> tuple[Series, list[LogLack]]:
     gimbal, aircraft, place = (series[i].copy() for i in (1, 2, 3))
     place[(place[:, :2] == 0).all(axis=1)] = np.nan  # no fix
     limits = {"gimbal angles": (gimbal, _LIMITS_DEG), "aircraft angles": (aircraft, _LIMITS_DEG)}
-    limits["positions"] = (place, np.array([90.0, 180.0, _MAX_HEIGHT_M]))
+    # Height, m, that no drone reaches.
+    limits["positions"] = (place, np.array([90.0, 180.0, 20_000.0]))
     damaged = np.zeros(len(place), bool)
     for name, (values, limit) in limits.items():
         known = ~np.isnan(values).any(axis=1)
         wrong = known & ~(np.abs(values) <= limit).all(axis=1)
-        if wrong.sum() > _DAMAGED_SHARE * known.sum():
+        # Largest share of states out of range that counts as damage, not as another meaning.
+        if wrong.sum() > 0.02 * known.sum():
             found = ", ".join(f"{v:.6g}" for v in values[np.argmax(wrong)])
             _refuse(path, f"{name} within {', '.join(f'{v:g}' for v in limit)}", f"({found})")
         damaged |= wrong
@@ -227,7 +226,8 @@ def plausible(path: Path, series: Series) -> tuple[Series, list[LogLack]]:
 
 def _zero(angles: np.ndarray) -> bool:
     known = angles[~np.isnan(angles).any(axis=1)]
-    return len(known) >= _LEAST_STATES and not known.any()
+    # States from which zeros throughout mean that nothing was filled in.
+    return len(known) >= 10 and not known.any()
 
 
 def _check_turns(path: Path, name: str, stamp_ns: np.ndarray, angles: np.ndarray) -> None:
@@ -235,7 +235,8 @@ def _check_turns(path: Path, name: str, stamp_ns: np.ndarray, angles: np.ndarray
     turns = np.abs((np.diff(angles[known], axis=0) + 180.0) % 360.0 - 180.0).max(axis=1, initial=0.0)
     possible = _TURN_DEG + _TURN_DEG_S * np.diff(stamp_ns[known]) * 1e-9
     share = float(np.mean(turns > possible)) if len(turns) else 0.0
-    if share > _TURNS_SHARE:
+    # Largest share of such turns: angles jump where a gimbal is recentred.
+    if share > 0.05:
         _refuse(path, f"{name} angles that turn steadily", f"{share:.0%} of them jump, by up to {turns.max():.0f} deg")
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 #: UTC in ns from which a time is one of a clock that was set (2001); a ground station without one starts at 1970.
 _MIN_UTC_NS = 1_000_000_000 * 10**9
-#: Latest time of a packet, us: the year 2100; a later one is damage.
-_LATEST_US = 4_102_444_800_000_000
 #: First bytes of a packet of MAVLink 1 and 2, https://mavlink.io/en/guide/serialization.html.
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD  # of MAVLink 2
@@ -120,7 +118,8 @@ def _packet_length(data: bytes, place: int) -> int | None:
         return None
     stamp_us = struct.unpack_from(">Q", data, place)[0]
     magic, payload, flags = data[place + 8], data[place + 9], data[place + 10]
-    if not 0 < stamp_us < _LATEST_US or magic not in (_MAGIC_V1, _MAGIC_V2):
+    # Latest time of a packet, us: the year 2100; a later one is damage.
+    if not 0 < stamp_us < 4_102_444_800_000_000 or magic not in (_MAGIC_V1, _MAGIC_V2):
         return 0
     length = payload + (8 if magic == _MAGIC_V1 else 12 + (13 if flags & 1 else 0))
     return length if len(data) >= place + 8 + length else None

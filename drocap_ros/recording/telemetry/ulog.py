@@ -14,6 +14,7 @@ from drocap_ros.errors import InputError, first_line
 from drocap_ros.flight.vehicle import ned_to_enu, orientation_to_ros, yaw_of
 from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import (
+    FIX_3D,
     Lack,
     LogFormat,
     LogLack,
@@ -40,10 +41,6 @@ _IN_TURN = 4
 _GPS = ("vehicle_gps_position", "sensor_gps")
 _GIMBAL = "gimbal_device_attitude_status"
 _TOPICS = ("vehicle_attitude", "vehicle_local_position", "vehicle_global_position", _GIMBAL, *_GPS)
-#: UTC in us from which a time is one of a GPS (2001).
-_EARLIEST_UTC_US = 1_000_000_000_000_000
-#: PX4's ``fix_type`` of a fix in three dimensions; more are better ones.
-_FIX_3D = 3
 #: MAVLink's GIMBAL_DEVICE_FLAGS_YAW_LOCK, _YAW_IN_VEHICLE_FRAME and _YAW_IN_EARTH_FRAME.
 _YAW_LOCK = 16
 _YAW_IN_VEHICLE = 32  # bit of the flags, as the next
@@ -176,7 +173,7 @@ def _gps(data: _Data) -> np.ndarray | None:
         geodetic = np.stack([data[name] for name in columns], axis=1).astype(np.float64)
     else:
         return None
-    geodetic[np.asarray(data["fix_type"]) < _FIX_3D] = np.nan
+    geodetic[np.asarray(data["fix_type"]) < FIX_3D] = np.nan
     return geodetic
 
 
@@ -202,7 +199,8 @@ def _utc(series: dict[str, _Data]) -> int | None:
         if gps is None or "time_utc_usec" not in gps:
             continue
         utc_us = np.asarray(gps["time_utc_usec"], dtype=np.int64)
-        known = utc_us > _EARLIEST_UTC_US
+        # UTC in us from which a time is one of a GPS (2001).
+        known = utc_us > 1_000_000_000_000_000
         if known.any():
             return int(np.median((utc_us - np.asarray(gps["timestamp"], np.int64))[known])) * 1000
     return None

@@ -14,7 +14,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion, load_motion, save_motion
-from drocap_ros.simulation.orbit_camera import project
+from drocap_ros.simulation.pinhole import project
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import read_npz
 

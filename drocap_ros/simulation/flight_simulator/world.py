@@ -13,7 +13,7 @@ from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.flight.vehicle import camera_rotation
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import MAX_EXPOSURES, FlightTruth
-from drocap_ros.simulation.orbit_camera import pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
@@ -21,13 +21,9 @@ from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 from drocap_ros.simulation.vehicle.mount import SimulatedMount
 from drocap_ros.skeleton import BODY_17
 
-#: Climb of the take-off.
-_CLIMB_M_S = 1.2
 #: Deceleration and lag of the simulated vehicle, by which the pilot lets go of the stick in time.
 _BRAKING_M_S2 = 1.45
 _LAG_S = 0.35  # s, of the simulated vehicle as well
-#: Height of the body on its skids.
-_SKIDS_M = 0.1
 #: Time on the ground, and of the hover before the hand-over.
 _READY_S = 1.0
 _HOVER_S = 1.5  # s; a judgement
@@ -42,7 +38,8 @@ class PilotedCopter(SimulatedCopter):
     """
 
     def __init__(self, transport: Transport, ground: np.ndarray, yaw: float, setup: CopterSetup) -> None:
-        super().__init__(transport, np.array([*ground, _SKIDS_M]), yaw, setup._replace(mode=""))
+        # Height of the body on its skids.
+        super().__init__(transport, np.array([*ground, 0.1]), yaw, setup._replace(mode=""))
         self.armed, self.landed_state = False, mavlink.MAV_LANDED_STATE_ON_GROUND
         self.stick: np.ndarray = np.zeros(3)
         self._ground: np.ndarray = self.body.position.copy()
@@ -98,7 +95,8 @@ class SimulatedPilot:
             copter.mount.command(math.degrees(math.atan2(float(sight[2]), float(np.hypot(sight[0], sight[1])))))
         if self.phase == PilotPhase.CHECKS and t_s >= _READY_S:
             copter.armed, copter.landed_state = True, mavlink.MAV_LANDED_STATE_TAKEOFF
-            copter.stick = np.array([0.0, 0.0, _CLIMB_M_S])
+            # Climb of the take-off.
+            copter.stick = np.array([0.0, 0.0, 1.2])
             self._enter(PilotPhase.CLIMB, t_s)
         elif self.phase == PilotPhase.CLIMB:
             climb = float(copter.body.velocity[2])
@@ -118,8 +116,6 @@ class SimulatedPilot:
 BEGINS_AFTER_S = 3.0
 #: Setpoints that stop for so long have stopped: several periods of the slowest stream.
 _GAP_S = 0.5
-#: Time constant of the person's start and stop.
-_REACTION_S = 0.3
 #: Rate and length of the pieces in which the person's motion is computed.
 _TAKE_HZ = 100.0
 _TAKE_CHUNK_S = 20.0  # s: a piece is computed while one is flown; a judgement
@@ -179,7 +175,8 @@ class FlightWorld:
             self._setpoint_s = t_s
         self._setpoints = self.copter.accepted_setpoints
         acts = t_s - self._setpoint_s <= _GAP_S and t_s - self._steered_s >= BEGINS_AFTER_S
-        self._pace += (float(acts) - self._pace) * (1 - math.exp(-passed_s / _REACTION_S))
+        # Time constant of the person's start and stop.
+        self._pace += (float(acts) - self._pace) * (1 - math.exp(-passed_s / 0.3))
         self._take_s += self._pace * passed_s
 
     def expose(self, stamp_ns: int) -> Exposure:

@@ -12,10 +12,6 @@ from drocap_ros.simulation.render.body import Layer, Look, Quadrics, body, dress
 from drocap_ros.simulation.render.scenery import Scenery, draw_background, draw_shadow, make_scenery
 from drocap_ros.skeleton import BODY_15, BODY_17
 
-#: Larger images, in px, have a background of half the resolution, for speed; haze and blur hide it.
-_FULL_BACKGROUND_PX = 300_000
-#: A person with a larger box, in px, is drawn at half the resolution, for speed.
-_FULL_PERSON_PX = 150_000
 #: Largest width and height, px.
 _MOST_PX = 8192
 
@@ -104,7 +100,8 @@ def draw_people(
         (surfaces, parts), look = bodies[i], people[i][1]
         visible = _in_camera(surfaces, rotation, position)
         colours = np.array([look.colours[part] for part in parts], np.float32)
-        factor = 2 if _person_px(visible, matrix, *size) > _FULL_PERSON_PX else 1
+        # A person with a larger box, in px, is drawn at half the resolution, for speed.
+        factor = 2 if _person_px(visible, matrix, *size) > 150_000 else 1
         shrunk = (_scaled(matrix, 1 / factor), -(-size[0] // factor), -(-size[1] // factor))
         layer = rasterize(visible, *shrunk, rotation @ scene.sun)
         if layer is None:
@@ -130,7 +127,8 @@ def _draw_surroundings(
     import cv2
 
     width, height = size
-    coarse = 2 if width * height > _FULL_BACKGROUND_PX else 1
+    # Larger images, in px, have a background of half the resolution, for speed; haze and blur hide it.
+    coarse = 2 if width * height > 300_000 else 1
     small = _scaled(matrix, 1 / coarse)
     reduced = (-(-width // coarse), -(-height // coarse))
     image = draw_background(scene, small, *reduced, rotation, position)

@@ -18,7 +18,6 @@ from drocap_ros.simulation.vehicle.flight_control import Target, manner_of
 
 _STEP_S = 0.01  # of the body and the loops
 _SETUP = CopterSetup()
-_SECOND_ANSWER_S = 0.04  # after the first, where a mode is answered twice: measured
 #: m/s, up; of modes that change the height by themselves.
 _CLIMB_M_S = {"RTL": 0.5, "LAND": -0.5}
 _LOST = "failsafe: setpoints lost"
@@ -132,7 +131,8 @@ class SimulatedCopter(ReportingCopter):
             result = self._change_mode(int(message.param2), int(message.param3))
             if self.kind.answers_twice:  # accepted at once, then in earnest
                 self._acknowledge(message, mavlink.MAV_RESULT_ACCEPTED)
-                self._answers.append((t_s + _SECOND_ANSWER_S, self._acknowledgement(message, result)))
+                # Measured, after the first answer.
+                self._answers.append((t_s + 0.04, self._acknowledgement(message, result)))
             else:
                 self._acknowledge(message, result)
         elif name == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW:

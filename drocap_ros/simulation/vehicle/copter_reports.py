@@ -18,8 +18,6 @@ from drocap_ros.simulation.vehicle.mavlink_vehicle import ESTIMATOR_HEALTHY, Enc
 from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
 
 _STEP_S = 0.1  # of the fitted processes; between their steps the errors are interpolated
-_SETTLED = 600  # steps from zero: several times the longest correlation, 13 s
-_YAW_WANDERS_S = 20.0  # within 10 to 60 s: recorded
 _DEAD_RECKONING_M_S = np.array([0.15, 0.075, 0.0])  # drift without satellites
 
 
@@ -40,7 +38,8 @@ class EstimateError:
         self._correlation = np.array([axis.correlation for axis in axes])
         self._now, self._before = np.zeros((3, 2)), np.zeros((3, 2))
         self._part = 0.0
-        for _ in range(_SETTLED):
+        # From zero it takes several times the longest correlation, 13 s.
+        for _ in range(600):
             self._advance()
         self._between: np.ndarray = self._before  # (3, 2) of position and velocity per axis, now
 
@@ -64,7 +63,8 @@ class EstimateError:
         self._between = (1.0 - self._part) * self._before + self._part * self._now
         if dead_reckoning:
             self.glitch = self.glitch + _DEAD_RECKONING_M_S * dt
-        share = math.exp(-dt / _YAW_WANDERS_S)
+        # It wanders within 10 to 60 s: recorded.
+        share = math.exp(-dt / 20.0)
         push = float(self._yaw_rng.standard_normal()) if self.yaw_sd else 0.0
         self.yaw = share * self.yaw + self.yaw_sd * math.sqrt(1.0 - share**2) * push
 
@@ -158,14 +158,6 @@ _NO_YAW = 1024 | 2048  # POSITION_TARGET_TYPEMASK: neither yaw nor its rate
 _PLACES = {mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT}
 
 
-class Readiness(NamedTuple):
-    """Path times, s, from which there is a satellite fix, a healthy estimator, and an origin of the local frame."""
-
-    fix_s: float = -1.0
-    estimator_s: float = -1.0
-    origin_s: float = -1.0
-
-
 class CopterSetup(NamedTuple):
     """Of a simulated copter.
 
@@ -175,7 +167,7 @@ class CopterSetup(NamedTuple):
     timeout_s : its own time-out without setpoints
     mode : at first; "" = that of the sticks
     mount : of the camera; None = a gimbal, level
-    readiness : when what the pilot waits for comes, one after the other
+    ready_s : path times, s, from which there is a satellite fix, a healthy estimator, and an origin of the local frame
     """
 
     autopilot: str = "ardupilot"
@@ -187,15 +179,16 @@ class CopterSetup(NamedTuple):
     timeout_s: float = 0.5
     mode: str = "LOITER"
     mount: SimulatedMount | None = None
-    readiness: Readiness = Readiness()
+    ready_s: tuple[float, float, float] = (-1.0, -1.0, -1.0)
 
 
 class ReportingCopter(SimulatedVehicle):
     """State of a copter and its telemetry; see :class:`drocap_ros.simulation.vehicle.copter.SimulatedCopter`."""
 
     def __init__(self, transport: Transport, position: np.ndarray, yaw: float, setup: CopterSetup) -> None:
-        self.mount, self.readiness = setup.mount or SimulatedMount(), setup.readiness
-        super().__init__(transport, None, setup.autopilot, gimbal=self.mount.kind != "fixed")
+        self.mount = setup.mount or SimulatedMount()
+        self._fix_s, self._estimator_s, self._origin_s = setup.ready_s
+        super().__init__(transport, setup.autopilot, gimbal=self.mount.kind != "fixed")
         if self.kind.mount_type_setting:
             self.settings[self.kind.mount_type_setting] = float(MOUNT_TYPES[self.mount.kind])
         self.body = Body(position, yaw, np.array(setup.wind, float), self.simulated.airframe, setup.seed)
@@ -260,7 +253,7 @@ class ReportingCopter(SimulatedVehicle):
         return super()._all_encoders() | {mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: self._echo}
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message | None:
-        if number in _PLACES and self._t < self.readiness.origin_s:
+        if number in _PLACES and self._t < self._origin_s:
             return None
         return super()._telemetry(number, self._report_s if self.frozen and self.frozen_clock else t_s, pose)
 
@@ -269,17 +262,16 @@ class ReportingCopter(SimulatedVehicle):
         mounted = self.mount.report(pose.orientation_xyzw, (pitch, yaw))
         if mounted is None:
             return None
-        return self._mav.gimbal_device_attitude_status_encode(
-            0, 0, self._boot_ms(t_s), mounted.flags, mounted.quaternion_wxyz, 0, 0, 0, 0
-        )
+        quaternion, flags = mounted
+        return self._mav.gimbal_device_attitude_status_encode(0, 0, self._boot_ms(t_s), flags, quaternion, 0, 0, 0, 0)
 
     def _estimator_flags(self) -> int:
         lost = self._t > min(self.ekf_failed_s, self.gps_lost_s + EKF_NOTICED_S)
-        blind = lost or self._t < self.readiness.estimator_s
+        blind = lost or self._t < self._estimator_s
         return _CONSTANT_POSITION if blind else super()._estimator_flags()
 
     def _satellites(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message:
-        there = self.readiness.fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
+        there = self._fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
         fix, place = 3 if there else 1, (473977420, 85455940, 488000)
         return self._mav.gps_raw_int_encode(self._boot_ms(t_s) * 1000, fix, *place, 60, 90, 0, 0, 17)
 

@@ -9,16 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drocap_ros.flight.autopilot import Autopilot
-from drocap_ros.flight.autopilot.autopilot import Gains, Simulated
+from drocap_ros.flight.autopilot.autopilot import Simulated
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
 
 MAX_LEAN_M_S2 = 5.66  # 30 degrees
-_YAW_GAIN = 5.8  # 1/s: yaw errors of recorded orbits
 _CLIMB_GAIN = 1.0  # 1/s of the height; this and the next two as ArduPilot ships
 _CLIMB_RATE_GAIN = 4.0  # 1/s of the climb
 _MAX_CLIMB_M_S = 2.5  # as ArduPilot ships
 _MAX_CLIMB_M_S2 = 3.0  # assumed
-_FILTER_HZ = 5.0  # of the velocity's error: PSC_NE_VEL_FLTE as shipped
 
 
 @dataclass
@@ -42,14 +40,14 @@ class Manner(enum.Enum):
 
 
 class FlightControl:
-    """Loops that command the body's acceleration.
+    """Loops that command the body's acceleration; stops and sticks.
 
     A subclass shapes what they follow: ``place``, ``pace`` and ``push`` are the wanted horizontal position, velocity
     and acceleration; ``place`` None leaves the position free.
     """
 
-    def __init__(self, gains: Gains, position: np.ndarray, yaw: float, drag: np.ndarray) -> None:
-        self.gains = gains
+    def __init__(self, simulated: Simulated, position: np.ndarray, yaw: float, drag: np.ndarray) -> None:
+        self._simulated, self.gains = simulated, simulated.gains
         self.target = Target(position=position.astype(float).copy(), yaw=yaw)
         self.manner = Manner.HOLD
         self.place: list[float] | None = [float(v) for v in position[:2]]
@@ -106,7 +104,8 @@ class FlightControl:
         """rad/s."""
         rate = self.target.yaw_rate
         if self.target.yaw is not None:
-            rate += _YAW_GAIN * math.remainder(self.target.yaw - yaw, 2 * math.pi)
+            # The gain, 1/s, gives the yaw errors of recorded orbits.
+            rate += 5.8 * math.remainder(self.target.yaw - yaw, 2 * math.pi)
         return rate
 
     def _shape(self, here: tuple[float, float], expired: bool, dt: float) -> None:
@@ -143,10 +142,15 @@ class FlightControl:
         command = _CLIMB_RATE_GAIN * error
         return min(max(command, -_MAX_CLIMB_M_S2), _MAX_CLIMB_M_S2) + self._integral[2]
 
-    def _stop_pace(self, gain: float, most: float, jerk: float, dt: float) -> None:
-        """Slow the wanted velocity down: rate ``gain`` per s, at most ``most`` m/s^2."""
-        wanted = limited(-gain * self.pace[0], -gain * self.pace[1], most)
-        self._advance(wanted, jerk, dt)
+    def _without_setpoints(self, dt: float) -> None:
+        """Move the wanted velocity towards that of the stick, or slow it down."""
+        simulated = self._simulated
+        if self.manner == Manner.STICK:
+            decay, wanted = simulated.stick, (float(self.target.velocity[0]), float(self.target.velocity[1]))
+        else:
+            decay, wanted = simulated.stop if self.manner == Manner.BRAKE else simulated.hold, (0.0, 0.0)
+        x, y = (decay.gain_per_s * (wanted[i] - self.pace[i]) for i in (0, 1))
+        self._advance(limited(x, y, decay.most_m_s2), simulated.jerk_m_s3, dt)
 
     def _advance(self, wanted: tuple[float, float], jerk: float, dt: float) -> None:
         """Move the wanted place and velocity; its acceleration follows ``wanted`` within the jerk.
@@ -169,7 +173,8 @@ class FlightControl:
 
 def filter_share(dt: float) -> float:
     """Share of a new value in a low pass of 5 Hz, which both autopilots have."""
-    return dt / (dt + 1 / (2 * math.pi * _FILTER_HZ))
+    # 5 Hz: PSC_NE_VEL_FLTE as shipped.
+    return dt / (dt + 1 / (2 * math.pi * 5.0))
 
 
 def limited(x: float, y: float, most: float) -> tuple[float, float]:
@@ -187,9 +192,6 @@ def rooted(x: float, y: float, gain: float, most: float) -> tuple[float, float]:
     return x * rate / error, y * rate / error
 
 
-_MAX_M_S = 10.0  # of the path: WP_SPD as shipped
-
-
 def control_of(autopilot: Autopilot, position: np.ndarray, yaw: float, drag: np.ndarray) -> FlightControl:
     """The loops of an autopilot in a hover."""
     assert autopilot.simulated is not None
@@ -205,25 +207,7 @@ def manner_of(autopilot: Autopilot, mode: str) -> Manner:
     return Manner.BRAKE if mode == autopilot.hold_mode else Manner.HOLD
 
 
-class _AutopilotControl(FlightControl):
-    """Stops and sticks."""
-
-    def __init__(self, simulated: Simulated, position: np.ndarray, yaw: float, drag: np.ndarray) -> None:
-        super().__init__(simulated.gains, position, yaw, drag)
-        self._simulated = simulated
-
-    def _without_setpoints(self, dt: float) -> None:
-        simulated, stick = self._simulated, self._simulated.stick
-        if self.manner == Manner.STICK:
-            gap = (float(self.target.velocity[i]) - self.pace[i] for i in (0, 1))
-            x, y = (stick.gain_per_s * v for v in gap)
-            self._advance(limited(x, y, stick.most_m_s2), simulated.jerk_m_s3, dt)
-        else:
-            decay = simulated.stop if self.manner == Manner.BRAKE else simulated.hold
-            self._stop_pace(decay.gain_per_s, decay.most_m_s2, simulated.jerk_m_s3, dt)
-
-
-class ContinuedControl(_AutopilotControl):
+class ContinuedControl(FlightControl):
     """Velocity grows by the acceleration, the position by both, until the time-out.
 
     Then velocity and acceleration become zero and the place that was reached is the target.  A copy of the target,
@@ -292,7 +276,8 @@ class ContinuedControl(_AutopilotControl):
         if target.position is not None:
             # Jerk over acceleration is the gain for the velocity, half of it that for the place.
             x, y = (float(target.position[i]) - self.place[i] for i in (0, 1))
-            closing = limited(*rooted(x, y, 0.5 * jerk / most, 0.5 * most), _MAX_M_S)
+            # 10 m/s: WP_SPD as shipped.
+            closing = limited(*rooted(x, y, 0.5 * jerk / most, 0.5 * most), 10.0)
             ahead = ahead[0] + closing[0], ahead[1] + closing[1]
         ahead = limited(*rooted(*ahead, jerk / most, jerk), most)
         forward = float(target.acceleration[0]), float(target.acceleration[1])
@@ -302,7 +287,7 @@ class ContinuedControl(_AutopilotControl):
         target.velocity = target.velocity + target.acceleration * dt
 
 
-class HeldControl(_AutopilotControl):
+class HeldControl(FlightControl):
     """A setpoint does not move on: its position, velocity and acceleration act together until the mode changes.
 
     Fitted to the recorded flights of PX4's SIH simulator.

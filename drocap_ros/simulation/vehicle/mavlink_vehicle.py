@@ -1,18 +1,15 @@
-"""A simulated MAVLink vehicle on a given path.
+"""A simulated MAVLink vehicle in the place of an autopilot.
 
-It replaces an autopilot: heartbeat, telemetry at the requested rates, acknowledgements, time synchronization.
-``python -m drocap_ros.simulation.vehicle.mavlink_vehicle --url URL`` runs it as a process of its own.
+It has heartbeat, telemetry at the requested rates, acknowledgements, and time synchronization.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import struct
-import threading
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -20,11 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import AUTOPILOTS, autopilot_of
 from drocap_ros.flight.mavlink.parser import CurrentMode, MavlinkParser, sign_with
-from drocap_ros.flight.mavlink.transport import Transport, open_transport
-from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, enu_to_ned, flu_to_frd, orientation_to_aviation
+from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.flight.vehicle import enu_to_ned, flu_to_frd, orientation_to_aviation
 from drocap_ros.geometry.geodesy import enu_to_geodetic
-from drocap_ros.geometry.rotations import quaternion_from_matrix, slerp
-from drocap_ros.simulation.orbit_camera import orbit_camera
 
 
 class VehiclePose(NamedTuple):
@@ -37,103 +32,37 @@ class VehiclePose(NamedTuple):
     gimbal_orientation_xyzw: np.ndarray
 
 
-class FlightPath(Protocol):
-    """A path that the simulated vehicle follows without error."""
-
-    def at(self, t_s: float) -> VehiclePose:
-        """Pose at an instant; at rest before the start and after the end."""
-
-
-class SampledPath:
-    """Path through sampled camera poses: the camera is at the vehicle's position, the nose follows its bearing.
-
-    t_s : (F,) increasing
-    rotation : (F, 3, 3) world ENU -> camera optical
-    position : (F, 3) m ENU
-    """
-
-    def __init__(self, t_s: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> None:
-        self._t = np.asarray(t_s, dtype=float)
-        self._position = position
-        self._velocity = np.gradient(position, self._t, axis=0) if len(self._t) > 1 else np.zeros_like(position)
-        self._camera = quaternion_from_matrix(np.swapaxes(rotation, 1, 2) @ OPTICAL_FROM_FLU)
-        forward = rotation[:, 2]
-        self._yaw = np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))
-
-    def at(self, t_s: float) -> VehiclePose:
-        """Pose at an instant."""
-        t = self._t
-        inside = float(np.clip(t_s, t[0], t[-1]))
-        i = int(np.clip(np.searchsorted(t, inside, side="right") - 1, 0, max(len(t) - 2, 0)))
-        j = min(i + 1, len(t) - 1)
-        part = (inside - t[i]) / (t[j] - t[i]) if j > i else 0.0
-        moving = 1.0 if t[0] <= t_s <= t[-1] else 0.0
-        yaw = (1 - part) * self._yaw[i] + part * self._yaw[j]
-        yaw_rate = (self._yaw[j] - self._yaw[i]) / (t[j] - t[i]) if j > i else 0.0
-        return VehiclePose(
-            (1 - part) * self._position[i] + part * self._position[j],
-            moving * ((1 - part) * self._velocity[i] + part * self._velocity[j]),
-            np.array([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]),
-            np.array([0.0, 0.0, moving * yaw_rate]),
-            slerp(self._camera[i], self._camera[j], part),
-        )
-
-
-def orbit_path(seconds: float, radius_m: float = 6.0, height_m: float = 2.5, speed_deg_s: float = 25.0) -> SampledPath:
-    """Orbit about a point 0.9 m above the origin."""
-    t = np.arange(0.0, seconds + 0.02, 0.02)
-    centre = np.broadcast_to(np.array([0.0, 0.0, 0.9]), (len(t), 3))
-    rotation, position = orbit_camera(t, centre, radius_m, height_m, speed_deg_s)
-    return SampledPath(t, rotation, position)
-
-
 #: A message by path time, s, and pose; None = none is due.
 Encode = Callable[[float, VehiclePose], mavlink.MAVLink_message | None]
 #: Latitude deg, longitude deg, altitude m of the local frame's origin.
 HOME = np.array([47.397742, 8.545594, 488.0])
-_CURRENT_MODE_S = 0.5  # an autopilot publishes its state so often, and every change at once: measured
 ESTIMATOR_HEALTHY = 831  # flags of both autopilots in the air: recorded
 _GIMBAL_FLAGS = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
 _GIMBAL_EARTH = _GIMBAL_FLAGS | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 
 
 class SimulatedVehicle:
-    """MAVLink vehicle on a link of its own.
+    """MAVLink vehicle on a link of its own; a subclass gives its pose.
 
-    link : a transport, or a URL of :func:`drocap_ros.flight.mavlink.transport.open_transport`
-    path : None = the subclass overrides :meth:`at`
     autopilot : name of one that has a simulated counterpart
     gimbal : whether it has a gimbal and reports its attitude
-    max_rate_hz : highest delivered rate, whatever was requested and acknowledged (a slow link)
     boot_s : time since boot at path time 0
-    signing_key : 32 bytes; it then signs its packets and drops unsigned ones
     """
 
-    def __init__(
-        self,
-        link: str | Transport,
-        path: FlightPath | None,
-        autopilot: str = "ardupilot",
-        *,
-        gimbal: bool = True,
-        max_rate_hz: float = 400.0,
-        boot_s: float = 30.0,
-        signing_key: bytes | None = None,
-    ) -> None:
+    def __init__(self, transport: Transport, autopilot: str, *, gimbal: bool, boot_s: float = 30.0) -> None:
         kind = autopilot_of(autopilot)
         if kind.simulated is None:
             raise InputError(f"autopilot: expected one of {', '.join(AUTOPILOTS)}, got {autopilot!r}")
         self.kind, self.simulated = kind, kind.simulated
-        self.path, self.autopilot, self.gimbal = path, autopilot, gimbal
+        self.autopilot, self.gimbal = autopilot, gimbal
         self.received: list[str] = []  # names of the received messages, for tests of what is sent
-        self._max_rate_hz, self.boot_s = max_rate_hz, boot_s
-        self._transport = open_transport(link) if isinstance(link, str) else link
+        #: Highest delivered rate, whatever was requested and acknowledged: lower on a slow link.
+        self.max_rate_hz = 400.0
+        self.boot_s, self._transport = boot_s, transport
         self._parser = MavlinkParser()
         #: Parameters of the autopilot by their names: a float, or an int.
         self.settings: dict[str, float] = dict(self.simulated.settings)
         self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
-        if signing_key is not None:
-            self.use_key(signing_key, time.time_ns())
         self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
         self._period_s |= {_number(name): period_s for name, period_s in self.simulated.streams.items()}
         self._encoders = self._all_encoders()
@@ -143,32 +72,11 @@ class SimulatedVehicle:
         #: The mode, and the one that was chosen last: an autopilot keeps it where a failsafe enters another.
         self.mode = self.intended = kind.control_mode
         self._mode_sent: tuple[float, tuple[int, int]] = (-math.inf, (0, 0))
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def __enter__(self) -> SimulatedVehicle:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def use_key(self, key: bytes, now_ns: int) -> None:
         """Sign from now on, and drop unsigned packets."""
         self._parser = MavlinkParser(key, now_ns)
         sign_with(self._mav, key, now_ns)
-
-    def start(self, clock_s: Callable[[], float] = time.monotonic) -> None:
-        """Fly in a thread, in real time; path time 0 is now."""
-        self._thread = threading.Thread(target=self.run, args=(clock_s,), name="simulated-vehicle", daemon=True)
-        self._thread.start()
-
-    def run(self, clock_s: Callable[[], float] = time.monotonic, seconds: float = math.inf) -> None:
-        """Fly in real time until :meth:`close`, or for some seconds."""
-        start = clock_s()
-        while not self._stop.is_set() and clock_s() - start < seconds:
-            data = self._transport.read(0.004)
-            # The time is taken after it: an answer to TIMESYNC must not be stamped before the question came.
-            self.step(clock_s() - start, data)
 
     def step(self, t_s: float, data: bytes | None = None) -> None:
         """Answer the messages received (None = what waits now) and send those due at path time ``t_s``."""
@@ -189,14 +97,10 @@ class SimulatedVehicle:
 
     def at(self, t_s: float) -> VehiclePose:
         """Reported pose at path time ``t_s``."""
-        assert self.path is not None
-        return self.path.at(t_s)
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Stop and close the port."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(2.0)
+        """Close the port."""
         self._transport.close()
 
     def _send(self, message: mavlink.MAVLink_message | None) -> None:
@@ -235,7 +139,7 @@ class SimulatedVehicle:
         if interval_us < 0:
             self._period_s.pop(number, None)
         else:
-            self._period_s[number] = max(interval_us * 1e-6, 1.0 / self._max_rate_hz)
+            self._period_s[number] = max(interval_us * 1e-6, 1.0 / self.max_rate_hz)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _known(self) -> frozenset[int]:
@@ -317,7 +221,8 @@ class SimulatedVehicle:
     def _current_mode(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message | None:
         sent_s, before = self._mode_sent
         present = self._present_modes()
-        if present == before and t_s - sent_s < _CURRENT_MODE_S:
+        # An autopilot publishes its state so often, and every change at once: measured.
+        if present == before and t_s - sent_s < 0.5:
             return None
         self._mode_sent = t_s, present
         return CurrentMode(0, *present)
@@ -355,45 +260,3 @@ def _degrees(pose: VehiclePose) -> tuple[int, int, int]:
 
 def _number(name: str) -> int:
     return int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
-
-
-def _setting(text: str) -> tuple[str, float]:
-    """Name and value of NAME=VALUE; a value without a decimal point is an int."""
-    name, _, value = text.partition("=")
-    try:
-        return name, int(value) if value.lstrip("-").isdigit() else float(value)
-    except ValueError:
-        raise InputError(f"--set: expected NAME=VALUE, got {text!r}") from None
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Run an orbit as a process."""
-    parser = argparse.ArgumentParser(prog="mavlink_vehicle", description=__doc__)
-    parser.add_argument("--url", default="udpout:127.0.0.1:14540", help="address of the companion computer")
-    parser.add_argument("--autopilot", choices=tuple(AUTOPILOTS), default="ardupilot")
-    parser.add_argument("--seconds", type=float, default=3600.0, help="length of the flight, s")
-    parser.add_argument("--radius", type=float, default=6.0, help="of the orbit, m")
-    parser.add_argument("--height", type=float, default=2.5, help="above the ground, m")
-    parser.add_argument("--speed", type=float, default=25.0, help="deg/s, counter-clockwise from above")
-    parser.add_argument("--max-rate", type=float, default=400.0, help="highest delivered rate of a message, Hz")
-    parser.add_argument(
-        "--set", nargs="*", default=[], metavar="NAME=VALUE", help="parameters of the autopilot, e.g. GUID_TIMEOUT=3"
-    )
-    parser.add_argument("--on-ground", action="store_true", help="it reports that it stands there, not armed")
-    args = parser.parse_args(arguments)
-    path = orbit_path(args.seconds, args.radius, args.height, args.speed)
-    try:
-        settings = dict(map(_setting, args.set))
-        with SimulatedVehicle(args.url, path, args.autopilot, max_rate_hz=args.max_rate) as vehicle:
-            vehicle.settings.update(settings)
-            if args.on_ground:
-                vehicle.armed, vehicle.landed_state = False, mavlink.MAV_LANDED_STATE_ON_GROUND
-            vehicle.run(seconds=args.seconds)
-    except InputError as error:
-        parser.exit(2, f"{error}\n")
-    except KeyboardInterrupt:
-        pass
-
-
-if __name__ == "__main__":
-    main()

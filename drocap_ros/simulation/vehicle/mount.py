@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,14 +13,6 @@ from drocap_ros.geometry.rotations import quaternion_multiply
 #: By the value of ArduPilot's MNT1_TYPE.
 MOUNT_TYPES = {"fixed": 0, "servo": 1, "gimbal": 6}
 _LIMITS_DEG = (-90.0, 30.0)
-_SERVO_LAG_S = 0.06  # s: a hobby servo turns 60 deg in 0.1 to 0.2 s; assumed
-
-
-class MountReport(NamedTuple):
-    """Content of GIMBAL_DEVICE_ATTITUDE_STATUS: (4,) w x y z and flags."""
-
-    quaternion_wxyz: np.ndarray
-    flags: int
 
 
 class SimulatedMount:
@@ -51,7 +42,8 @@ class SimulatedMount:
             return
         demanded = self._demanded(body_xyzw())
         before = demanded if self._tilt is None else self._tilt
-        self._tilt = before + (demanded - before) * (1 - math.exp(-dt / _SERVO_LAG_S))
+        # A hobby servo turns 60 deg in 0.1 to 0.2 s; its lag of 0.06 s is assumed.
+        self._tilt = before + (demanded - before) * (1 - math.exp(-dt / 0.06))
 
     def camera(self, body_xyzw: np.ndarray) -> np.ndarray:
         """(4,) camera FLU -> ENU, truth, on a body (4,) FLU -> ENU."""
@@ -60,8 +52,12 @@ class SimulatedMount:
         tilt = self.pitch if self.kind == "fixed" or self._tilt is None else self._tilt
         return tilted_camera(body_xyzw, tilt)
 
-    def report(self, body_xyzw: np.ndarray, gimbal_error_rad: tuple[float, float] = (0.0, 0.0)) -> MountReport | None:
+    def report(
+        self, body_xyzw: np.ndarray, gimbal_error_rad: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[np.ndarray, int] | None:
         """What the autopilot reports of its mount, with the errors of a gimbal's pitch and yaw; None without a mount.
+
+        That is the content of GIMBAL_DEVICE_ATTITUDE_STATUS: (4,) w x y z, and flags.
 
         body_xyzw : (4,) FLU -> ENU as the autopilot estimates it
         """
@@ -75,7 +71,7 @@ class SimulatedMount:
         x, y, z, w = quaternion_from_euler(0.0, pitch, yaw)
         # ArduPilot sets the first two for every mount, servos included.
         locked = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
-        return MountReport(np.array([w, x, y, z]), int(locked | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME))
+        return np.array([w, x, y, z]), int(locked | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME)
 
     def _demanded(self, body_xyzw: np.ndarray) -> float:
         """rad, angle of the servo: what is wanted, less the body's pitch."""

@@ -21,7 +21,8 @@ from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.vehicle import camera_rotation
-from drocap_ros.simulation.vehicle.mavlink_vehicle import HOME, SimulatedVehicle, orbit_path
+from drocap_ros.simulation.vehicle.mavlink_vehicle import HOME
+from lab.simulation.path_vehicle import PathVehicle, orbit_path
 
 S = 1_000_000_000
 _TIOCGEXCL = 0x80045440  # ioctl of Linux: whether a terminal is used exclusively
@@ -46,7 +47,7 @@ def spin_until(link, predicate, timeout_s=20.0):
 def test_state_of_a_simulated_vehicle(port, autopilot):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", rate_window_s=1.0)
     path = orbit_path(60)
-    with MavlinkLink(config) as link, SimulatedVehicle(f"udpout:127.0.0.1:{port}", path, autopilot) as vehicle:
+    with MavlinkLink(config) as link, PathVehicle(f"udpout:127.0.0.1:{port}", path, autopilot) as vehicle:
         start_ns = time.time_ns()
         vehicle.start()
         states = spin_until(
@@ -75,7 +76,7 @@ def test_state_of_a_simulated_vehicle(port, autopilot):
 
 def test_wanted_rates_arrive(port):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", attitude_hz=40.0, position_hz=10.0, rate_window_s=1.0)
-    with MavlinkLink(config) as link, SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60)) as vehicle:
+    with MavlinkLink(config) as link, PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60)) as vehicle:
         vehicle.start()
         end = time.monotonic() + 2.5
         spin_until(link, lambda _: time.monotonic() > end)
@@ -88,7 +89,7 @@ def test_acknowledged_rate_that_does_not_arrive_is_requested_again(port):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", rate_window_s=1.0, request_retry_s=0.2)
     with (
         MavlinkLink(config) as link,
-        SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), max_rate_hz=3) as slow,
+        PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), max_rate_hz=3) as slow,
     ):
         slow.start()
         end = time.monotonic() + 3.0
@@ -100,7 +101,7 @@ def test_acknowledged_rate_that_does_not_arrive_is_requested_again(port):
 
 def test_state_without_a_gimbal_has_unknown_orientation(port):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")
-    with MavlinkLink(config) as link, SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), gimbal=False) as v:
+    with MavlinkLink(config) as link, PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), gimbal=False) as v:
         v.start()
         states = spin_until(link, lambda s: s and link.status().refused)
         assert link.status().refused == {"GIMBAL_DEVICE_ATTITUDE_STATUS": mavlink.MAV_RESULT_DENIED}
@@ -111,12 +112,12 @@ def test_link_recovers_after_a_loss(port):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", link_timeout_s=0.5)
     with MavlinkLink(config) as link:
         assert not link.status().connected
-        with SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60)) as vehicle:
+        with PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60)) as vehicle:
             vehicle.start()
             spin_until(link, lambda s: len(s) > 3)
         spin_until(link, lambda _: not link.status().connected)
         assert link.estimator.snapshot(time.time_ns()).link_age_s > 0.4
-        with SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), boot_s=2.0) as vehicle:  # restarted
+        with PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), boot_s=2.0) as vehicle:  # restarted
             vehicle.start()
             states = spin_until(link, lambda s: len(s) > 20)
         assert abs(states[-1].stamp_ns - time.time_ns()) < S
@@ -127,7 +128,7 @@ def test_link_thread_delivers_states_and_stops(port):
     with MavlinkLink(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")) as link:
         thread = threading.Thread(target=link.run, args=(states.append, stop))
         thread.start()
-        with SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60)) as vehicle:
+        with PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60)) as vehicle:
             vehicle.start()
             end = time.monotonic() + 20
             while len(states) < 5 and time.monotonic() < end:

@@ -11,7 +11,7 @@ from drocap_ros.flight.mavlink.commands import halt_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser, read_signing_key, sign_with, signing_time
 from drocap_ros.simulation.vehicle.loopback import free_udp_port
-from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle, orbit_path
+from lab.simulation.path_vehicle import PathVehicle, orbit_path
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
 NOW_NS = 1_800_000_000_000_000_000
@@ -37,7 +37,7 @@ def test_signed_link_works_with_the_same_key(key_file):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", signing_key_file=key_file, commands_enabled=True)
     with (
         MavlinkLink(config) as link,
-        SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), signing_key=KEY) as vehicle,
+        PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), signing_key=KEY) as vehicle,
     ):
         assert states_within(link, vehicle, 20)
         # The watchdog's words go to the vehicle too, again and again, though they are another stream.
@@ -57,7 +57,7 @@ def test_packets_without_our_key_are_refused_in_both_directions(key_file, key):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", signing_key_file=key_file)
     with (
         MavlinkLink(config) as link,
-        SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), "px4", signing_key=key) as vehicle,
+        PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), "px4", signing_key=key) as vehicle,
     ):
         assert states_within(link, vehicle, 1.5) == []
         assert not link.status().connected
@@ -70,7 +70,7 @@ def test_signing_vehicle_refuses_an_unsigned_link():
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")
     with (
         MavlinkLink(config) as link,
-        SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), "px4", signing_key=KEY) as vehicle,
+        PathVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), "px4", signing_key=KEY) as vehicle,
     ):
         assert states_within(link, vehicle, 20)  # its own stream of attitude comes, and is not checked
         for _ in range(20):

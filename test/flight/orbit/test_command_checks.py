@@ -109,7 +109,7 @@ def answers_of(commands):
 
 def test_a_second_start_names_the_command_that_changes_its_values():
     seen = changed(GOOD, mode="LOITER", in_control=False)
-    allowed = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, mode_change_allowed=True))
+    allowed = dataclasses.replace(LIMITS, mode_change_allowed=True)
     requesting = reduce(Idle(), seen, 1.0, Command.ENGAGE, allowed)[0]
     for state, now, word in ((orbiting(), GOOD, "adjust"), (requesting, seen, "stop")):
         answer = reduce(state, now, 1.1, Command.ENGAGE, allowed)[1].answer

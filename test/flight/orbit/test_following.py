@@ -139,7 +139,7 @@ def test_each_orbit_is_judged_anew():
 
 
 def test_vehicle_that_does_not_reach_its_place_on_the_orbit_slows_down_and_then_holds():
-    keeping, state, codes = Keeping(LIMITS.orbit), orbiting(), []
+    keeping, state, codes = Keeping(LIMITS), orbiting(), []
     place = GOOD.vehicle.position
     for i in range(500):
         t = 1.0 + 0.05 * i

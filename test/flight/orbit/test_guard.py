@@ -11,9 +11,9 @@ from drocap_ros.flight.orbit.speed import limit_closing
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.simulation.keypoint_errors import detect_person
-from drocap_ros.simulation.orbit_camera import pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
+from lab.simulation.keypoint_errors import detect_person
 
 S = 1_000_000_000
 MATRIX, SIZE = pinhole_matrix(1280, 720, 60.0), (1280, 720)

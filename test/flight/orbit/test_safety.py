@@ -228,7 +228,7 @@ def test_start_never_changes_the_mode_and_engage_only_when_allowed():
     state, decision = reduce(Idle(), LOITER, 0.0, Command.START, LIMITS)
     assert refusal(decision) == ConditionCode.NOT_IN_CONTROL_MODE
     assert decision.mode_request == ModeRequest.NONE
-    forbidden = LIMITS._replace(safety=SafetyConfig(commands_enabled=True))
+    forbidden = dataclasses.replace(LIMITS, mode_change_allowed=False)
     state, decision = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, forbidden)
     assert refusal(decision) == ConditionCode.MODE_CHANGE_FORBIDDEN
     assert decision.mode_request == ModeRequest.NONE
@@ -278,7 +278,7 @@ def test_a_state_says_what_leads_out(state, seen, words):
 
 
 def test_without_the_permission_to_change_the_mode_the_pilot_or_the_configuration_leads_out():
-    forbidden = LIMITS._replace(safety=SafetyConfig(commands_enabled=True))
+    forbidden = dataclasses.replace(LIMITS, mode_change_allowed=False)
     for seen in (LOITER, changed(LOITER, autopilot="px4")):
         found = way_out(Ready(), seen, forbidden)
         assert "set it to true" in found
@@ -312,15 +312,16 @@ def test_after_a_hold_at_the_fence_the_next_orbit_has_a_fence_of_its_own():
 
 
 def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():
-    limits = LIMITS._replace(warm_up_s=1.2)
-    state, decision = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, limits)
+    loiter = dataclasses.replace(LOITER, autopilot=dataclasses.replace(LOITER.autopilot, warm_up_s=1.2))
+    state, decision = reduce(Idle(), loiter, 0.0, Command.ENGAGE, LIMITS)
     assert decision[:2] == (Action.HOLD, ModeRequest.NONE)
     assert decision.answer.condition.code == ConditionCode.REQUESTING_CONTROL
-    assert reduce(state, LOITER, 1.3, None, limits)[1].mode_request == ModeRequest.CONTROL
-    assert reduce(state, LOITER, 7.0, None, limits)[0].condition.code == ConditionCode.CONTROL_NOT_GRANTED
-    assert reduce(state, changed(LOITER, mode="LAND"), 1.0, None, limits)[0].state == State.TAKEN_OVER
-    assert reduce(state, bad("gps", LOITER), 1.0, None, limits)[1].action == Action.NOTHING
-    assert reduce(state, LOITER, 1.0, Command.STOP, limits)[1].action == Action.NOTHING
+    assert reduce(state, loiter, 1.1, None, LIMITS)[1].mode_request == ModeRequest.NONE
+    assert reduce(state, loiter, 1.3, None, LIMITS)[1].mode_request == ModeRequest.CONTROL
+    assert reduce(state, loiter, 7.0, None, LIMITS)[0].condition.code == ConditionCode.CONTROL_NOT_GRANTED
+    assert reduce(state, changed(loiter, mode="LAND"), 1.0, None, LIMITS)[0].state == State.TAKEN_OVER
+    assert reduce(state, bad("gps", loiter), 1.0, None, LIMITS)[1].action == Action.NOTHING
+    assert reduce(state, loiter, 1.0, Command.STOP, LIMITS)[1].action == Action.NOTHING
 
 
 @pytest.mark.parametrize("speed_m_s", [0.5, 2.0, 5.0])
@@ -363,7 +364,7 @@ def test_control_that_is_granted_when_nobody_asks_for_it_any_more_is_held_where_
 def test_disarming_ends_the_orbit_and_disabled_commands_are_refused():
     state, decision = reduce(orbiting(), changed(GOOD, armed=False), 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.IDLE, Action.NOTHING)
-    off = LIMITS._replace(safety=SafetyConfig())
+    off = dataclasses.replace(LIMITS, commands_enabled=False)
     state, decision = reduce(Idle(), GOOD, 0.0, Command.START, off)
     assert refusal(decision) == ConditionCode.COMMANDS_DISABLED
 
@@ -419,7 +420,7 @@ def test_a_retreat_ends_at_the_fence_and_never_leads_to_the_subject(east_m, nort
         assert hold[0] >= east_m
         assert hold[1] == pytest.approx(north_m)
         centre_m, own_m = np.linalg.norm(hold[:2]), np.linalg.norm(here[:2])
-        assert centre_m <= max(LIMITS.safety.fence_radius_m, own_m) + 1e-6
+        assert centre_m <= max(LIMITS.fence_radius_m, own_m) + 1e-6
     assert state.position[0] > east_m or own_m > 39.0  # it does retreat
 
 
@@ -540,7 +541,7 @@ def test_hold_mode_is_requested_at_once_when_setpoints_are_not_followed():
 
 def test_too_long_a_timeout_of_the_autopilot_forbids_motion():
     seen = changed(GOOD, loss_settings=LossSettings("GUID_TIMEOUT", 3.0, "", math.nan))
-    limits = LIMITS._replace(max_control_timeout_s=0.5)
+    limits = dataclasses.replace(LIMITS, max_control_timeout_s=0.5)
     _, decision = reduce(Idle(), seen, 0.0, Command.START, limits)
     assert refusal(decision) == ConditionCode.TIMEOUT_TOO_LONG
     assert reduce(orbiting(), seen, 1.0, None, limits)[0].state == State.HOLDING
@@ -554,7 +555,7 @@ def test_a_least_voltage_needs_a_known_one():
     assert battery_condition(0.9, 13.9, safety).code == ConditionCode.BATTERY_LOW
 
 
-SAFETY = LIMITS.safety
+SAFETY = LIMITS
 BRAKING = SAFETY.braking_m_s2
 
 

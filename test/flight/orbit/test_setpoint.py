@@ -10,14 +10,13 @@ from orbit_observations import GOOD, changed
 from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.autopilot.px4 import PX4
-from drocap_ros.flight.bridge_config import OrbitConfig, OrbitGoal, SafetyConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig, OrbitGoal
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.setpoint import Shortfall, harmless
 from drocap_ros.flight.orbit.speed import coast_speed, slowed_condition
-from drocap_ros.flight.orbit.states import Limits
 
-LIMITS = Limits(SafetyConfig(), OrbitConfig())
+LIMITS = MavlinkBridgeConfig()
 ZERO, CENTRE = np.zeros(3), np.zeros(2)
 
 
@@ -64,7 +63,7 @@ def test_px4_falls_behind_along_the_orbit_before_it_yields_the_radius():
     assert sent.velocity[0] == pytest.approx(-0.9)
     assert (sent.position - now.vehicle.position)[1] < 1.2
     coast = PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5)
-    assert coast.length_m <= 0.82 * LIMITS.safety.max_coast_m
+    assert coast.length_m <= 0.82 * LIMITS.max_coast_m
 
 
 def test_px4_is_not_pulled_to_a_far_place_faster_than_it_may_fly():
@@ -106,7 +105,7 @@ def test_px4_that_lacks_more_of_its_distance_retreats_no_more_slowly():
         sent = sent_of(wanted, now, comes, CENTRE, LIMITS)
         assert isinstance(sent, Setpoint)
         coast = PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5)
-        assert coast.length_m <= 0.82 * LIMITS.safety.max_coast_m
+        assert coast.length_m <= 0.82 * LIMITS.max_coast_m
         ways.append((sent.position - now.vehicle.position)[0])
     assert min(ways) > 0.5
     assert np.all(np.diff(ways) > -0.05)
@@ -137,9 +136,8 @@ def test_a_vehicle_that_leaves_a_near_subject_may_go_on():
 
 
 def test_the_coast_stays_inside_the_fence():
-    safety = dataclasses.replace(LIMITS.safety, fence_radius_m=10.0)
+    limits = dataclasses.replace(LIMITS, fence_radius_m=10.0)
     now = seen(position=(8.5, 0.0, 2.5), velocity=(2.0, 0.0, 0.0), subject=(3.0, 0.0, 1.0))
-    limits = LIMITS._replace(safety=safety)
     assert isinstance(sent_of(flight(now), now, ZERO, None, limits), Setpoint)
     slowed = sent_of(flight(now), now, ZERO, CENTRE, limits)
     assert isinstance(slowed, Setpoint)

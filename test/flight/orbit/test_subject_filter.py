@@ -10,8 +10,8 @@ from drocap_ros.flight.subject.subject_measurement import locate_subject
 from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, CameraPose, PoseHistory, VehicleFilter, VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.skeleton import BODY_15
+from lab.simulation.capture import SimulationConfig, simulate_capture
 
 S = 1_000_000_000
 

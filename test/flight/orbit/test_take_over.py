@@ -1,5 +1,6 @@
 """Whose mode it is: the pilot's, the autopilot's own, or one that was requested."""
 
+import dataclasses
 import math
 import random
 
@@ -17,12 +18,11 @@ from drocap_ros.flight.orbit.states import Action, Command, Idle, ModeRequest, S
 PX4 = changed(GOOD, autopilot="px4", mode="OFFBOARD", heard=frozenset({"OFFBOARD"}))
 HOLD = changed(PX4, mode="LOITER", heard=frozenset({"LOITER"}), in_control=False, in_hold=True)
 FAILSAFE = changed(HOLD, left_by_itself=True)
-WARM = LIMITS._replace(warm_up_s=1.2)
 
 
 def engaged(seen):
-    state, _ = reduce(Idle(), seen, 0.0, None, WARM)
-    state, decision = reduce(state, seen, 0.1, Command.ENGAGE, WARM)
+    state, _ = reduce(Idle(), seen, 0.0, None, LIMITS)
+    state, decision = reduce(state, seen, 0.1, Command.ENGAGE, LIMITS)
     assert decision.answer.accepted
     return state
 
@@ -35,43 +35,43 @@ def test_a_mode_that_was_heard_between_two_steps_is_a_take_over():
 
 def test_control_that_the_stream_restores_while_it_is_requested_is_no_take_over():
     state = engaged(FAILSAFE)
-    state, decision = reduce(state, PX4, 0.2, None, WARM)
+    state, decision = reduce(state, PX4, 0.2, None, LIMITS)
     assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
     pilot = changed(PX4, mode="POSCTL", heard=frozenset({"POSCTL"}), in_control=False)
-    state, decision = reduce(engaged(FAILSAFE), pilot, 0.2, None, WARM)
+    state, decision = reduce(engaged(FAILSAFE), pilot, 0.2, None, LIMITS)
     assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
 
 
 def test_the_autopilots_own_hold_is_not_called_the_pilots_and_engage_follows_it():
-    state, decision = reduce(orbiting(PX4), FAILSAFE, 1.0, None, WARM)
+    state, decision = reduce(orbiting(PX4), FAILSAFE, 1.0, None, LIMITS)
     assert (state.state, decision[:2]) == (State.HOLDING, (Action.NOTHING, ModeRequest.NONE))
     assert state.condition.code == ConditionCode.SETPOINTS_NOT_FOLLOWED
     assert "by itself" in state.reason
-    state, decision = reduce(state, FAILSAFE, 2.0, Command.ENGAGE, WARM)
+    state, decision = reduce(state, FAILSAFE, 2.0, Command.ENGAGE, LIMITS)
     assert (decision.answer.accepted, decision.action) == (True, Action.HOLD)
 
 
 def test_another_failsafe_ends_the_commands_too():
     landing = changed(FAILSAFE, mode="LAND", heard=frozenset({"LAND"}), in_hold=False)
-    state, decision = reduce(orbiting(PX4), landing, 1.0, None, WARM)
+    state, decision = reduce(orbiting(PX4), landing, 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
     assert state.condition.code == ConditionCode.SETPOINTS_NOT_FOLLOWED
 
 
 def test_the_words_follow_when_the_intention_is_reported_after_the_mode():
-    state, _ = reduce(orbiting(PX4), HOLD, 1.0, None, WARM)
+    state, _ = reduce(orbiting(PX4), HOLD, 1.0, None, LIMITS)
     assert (state.state, state.condition.code) == (State.TAKEN_OVER, ConditionCode.PILOT_TOOK_OVER)
-    state, decision = reduce(state, FAILSAFE, 1.1, None, WARM)
+    state, decision = reduce(state, FAILSAFE, 1.1, None, LIMITS)
     assert (state.state, decision.action) == (State.HOLDING, Action.NOTHING)
-    state, _ = reduce(orbiting(PX4), HOLD, 1.0, None, WARM)
-    assert reduce(state, HOLD, 1.1, None, WARM)[0].state == State.TAKEN_OVER
+    state, _ = reduce(orbiting(PX4), HOLD, 1.0, None, LIMITS)
+    assert reduce(state, HOLD, 1.1, None, LIMITS)[0].state == State.TAKEN_OVER
 
 
 @pytest.mark.parametrize("timeout_s", [0.5, 3.0])
 @pytest.mark.parametrize("seen", [GOOD, PX4])
 def test_a_stream_that_was_interrupted_does_not_resume_by_itself(seen, timeout_s):
     seen = changed(seen, loss_settings=LossSettings("", timeout_s, "", 5))
-    limits = LIMITS._replace(max_control_timeout_s=3.0)
+    limits = dataclasses.replace(LIMITS, max_control_timeout_s=3.0)
     state, decision = reduce(orbiting(), GOOD, 1.0, Command.STOP, limits)
     assert decision.action == Action.HOLD
     state = permit_mode(state, seen.mode.name)
@@ -100,7 +100,7 @@ def test_after_a_foreign_mode_nothing_is_sent_until_the_operator_commands(seed):
             PX4, mode=mode, heard=heard | {mode}, in_control=mode == "OFFBOARD", in_hold=mode == "LOITER",
             left_by_itself=chance.random() < 0.5 and mode not in ("OFFBOARD", ""),
         )  # fmt: skip
-        state, decision = reduce(state, seen, t, None, WARM)
+        state, decision = reduce(state, seen, t, None, LIMITS)
         foreign |= bool((heard | {mode}) - {"OFFBOARD", ""})
         t += 0.05
         if foreign:

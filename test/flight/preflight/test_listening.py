@@ -13,7 +13,7 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.preflight.measure import Listening, all_findings, is_ready, version_text
 from drocap_ros.flight.preflight.setup_checks import Setup
-from drocap_ros.simulation.orbit_camera import pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
@@ -238,7 +238,7 @@ def test_the_autopilots_fence_is_compared_with_ours(autopilot, settings, words):
 
 @BOTH
 def test_low_rates_are_missing_where_a_condition_depends_on_them(autopilot):
-    scene = Scene(autopilot, before=lambda scene: setattr(scene.copter, "_max_rate_hz", 4.0))
+    scene = Scene(autopilot, before=lambda scene: setattr(scene.copter, "max_rate_hz", 4.0))
     assert scene.missing() == {"rate_attitude_quaternion", "rate_local_position_ned"}
     assert scene.findings["rate_attitude_quaternion"].values["real_hz"] == pytest.approx(4, abs=0.5)
     assert "port of its own" in scene.findings["rate_local_position_ned"].remedy

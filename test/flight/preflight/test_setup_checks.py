@@ -10,7 +10,8 @@ from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.preflight.setup_checks import Setup, best_pitch_deg, person_in_picture, setup_findings
 from drocap_ros.flight.vehicle import VehicleState
-from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
+from lab.simulation.orbit import look_at
 
 MATRIX = pinhole_matrix(1280, 720, 60.0)
 SETUP = Setup(MATRIX, (1280, 720), "calibrated", True, "/dev/video0", 1.7, "models")

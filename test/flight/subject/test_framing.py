@@ -15,7 +15,7 @@ from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.flight.subject.framing import Framing, View, framing_margin, nearest_framed
 from drocap_ros.flight.vehicle import VehicleState, camera_rotation
-from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.vehicle.mount import tilted_camera
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 

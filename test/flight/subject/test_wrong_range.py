@@ -10,8 +10,8 @@ from drocap_ros.flight.orbit.planner import least_radius
 from drocap_ros.flight.subject.subject_filter import SubjectFilter
 from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
+from lab.simulation.capture import SimulationConfig, simulate_capture
 
 S = 1_000_000_000
 

@@ -12,12 +12,13 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import limited_use, models_folder
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw
 from drocap_ros.simulation.render.scenery import make_scenery
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
+from lab.simulation.orbit import orbit_camera
 from lab.training.rendered_samples import (
     DETECTOR_SIZE,
     FIRST_SEED,

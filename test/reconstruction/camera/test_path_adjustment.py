@@ -86,6 +86,7 @@ def test_step_solves_the_normal_equations_of_all_unknowns() -> None:
     r = residuals(rng, data)
     step = PathEquations(r).step()
     assert step is not None
+    errors, shared, points = step
     image, by_point, by_camera = r.weighted, r.by_point, r.by_camera
     knots, views = data.knots, data.views
     used = KNOT * knots.count
@@ -97,14 +98,14 @@ def test_step_solves_the_normal_equations_of_all_unknowns() -> None:
         rows[i, :, used : used + SHARED] = by_camera[i, :, KNOT:]
         rows[i, :, used + SHARED + 3 * piece : used + SHARED + 3 * piece + 3] = by_point[i]
     flat = rows.reshape(-1, rows.shape[2])
-    change = np.concatenate([step.errors.reshape(-1), step.shared, step.points.reshape(-1)])
+    change = np.concatenate([errors.reshape(-1), shared, points.reshape(-1)])
     # The terms in time have a gradient that is linear in the errors and the shared unknowns.
-    moved = replace(r.state, errors=r.state.errors + step.errors, shared=r.state.shared + step.shared)
+    moved = replace(r.state, errors=r.state.errors + errors, shared=r.state.shared + shared)
     before, after = (PathResiduals(data, r.weights, state, 1e-12) for state in (r.state, moved))
     of_time = np.concatenate([(a - b).reshape(-1) for a, b in zip(gradient(after), gradient(before), strict=True)])
     pull = flat.T @ image.reshape(-1)
     curved = flat.T @ (flat @ change) + of_time
-    curved[used + SHARED :] += 10.0 * step.points.reshape(-1)  # what holds points without parallax
+    curved[used + SHARED :] += 10.0 * points.reshape(-1)  # what holds points without parallax
     np.testing.assert_allclose(
         curved, -np.concatenate([g.reshape(-1) for g in gradient(r)]), atol=1e-4 * abs(pull).max()
     )

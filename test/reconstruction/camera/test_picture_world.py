@@ -17,9 +17,9 @@ from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.camera.upright import set_upright
 from drocap_ros.reconstruction.reconstruct import reconstruct, solve
 from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
-from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
+from lab.simulation.capture import SimulationConfig, simulate_capture
 
 FPS = 24.0
 FRAMES = 120

@@ -14,9 +14,9 @@ from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.evidence import body_places, with_evidence
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import load_tracks, save_tracks
+from lab.simulation.capture import simulate_capture
 from lab.studies.near_camera import NearCamera, known
 from lab.studies.protocol import Sequence, protocol_sequences
 

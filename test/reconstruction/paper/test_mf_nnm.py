@@ -61,7 +61,7 @@ def test_shapes_are_exact_for_known_rotations(motion: LowRank) -> None:
     s, config = None, BundleAdjusterConfig(iterations=300, tolerance=0.0)
     for alpha in (3.0, 1.0, 0.3, 0.1, 0.03, 0.01):
         config = BundleAdjusterConfig(alpha=alpha, gamma=0.0, iterations=300, tolerance=0.0)
-        s, _, _ = minimize_nuclear_norm(motion.w, information, motion.rotation, config, initial=s)
+        s, _ = minimize_nuclear_norm(motion.w, information, motion.rotation, config, initial=s)
     poses = s @ np.swapaxes(motion.rotation, 1, 2)
     assert pa_mpjpe(poses, motion.camera).mean() < 1e-3
 
@@ -69,13 +69,13 @@ def test_shapes_are_exact_for_known_rotations(motion: LowRank) -> None:
 def test_the_walk_is_not_mirrored(dictionary: Dictionary) -> None:
     walk = make_walk(240, speed_deg_s=90.0)
     w = walk.in_camera[..., :2] / 0.35
-    poses, terms, iterations, stop = factorize(w, information_from(w, None, None), dictionary, BundleAdjusterConfig())
+    poses, report = factorize(w, information_from(w, None, None), dictionary, BundleAdjusterConfig())
     truth = 1000.0 * walk.in_camera
     assert not is_mirrored(poses, truth)
     assert pa_mpjpe(poses, truth).mean() < 40.0
-    assert iterations > 0
-    assert stop in ("converged", "iterations")
-    assert set(terms) >= {"reprojection", "nuclear_norm"}
+    assert report.iterations > 0
+    assert report.stop_reason in ("converged", "iterations")
+    assert set(report.cost_terms) >= {"reprojection", "nuclear_norm"}
 
 
 def test_gaps_are_interpolated_over_time() -> None:

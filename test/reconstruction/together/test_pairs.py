@@ -17,10 +17,11 @@ from drocap_ros.reconstruction.reconstruct import Solved, solve
 from drocap_ros.reconstruction.together.joined import join_views
 from drocap_ros.report.checks import MotionCheck, run_checks
 from drocap_ros.report.statistics import motion_statistics
-from drocap_ros.simulation.orbit_camera import orbit_camera, project
+from drocap_ros.simulation.pinhole import project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
+from lab.simulation.orbit import orbit_camera
 
 SIZE, FPS, SECONDS, LATER_S = (720, 1280), 24.0, 6.0, 0.375
 #: Focal lengths over the longer side, of phones whose video is stabilized: 0.85 is assumed.

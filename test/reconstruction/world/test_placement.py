@@ -12,10 +12,10 @@ from drocap_ros.camera_path import CameraPath
 from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.world.placement import estimate_scale, metres_per_px, place_in_world, smooth_over_time
-from drocap_ros.simulation.capture import SimulatedCapture, SimulationConfig, simulate_capture
-from drocap_ros.simulation.orbit_camera import orbit_camera
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
+from lab.simulation.capture import SimulatedCapture, SimulationConfig, simulate_capture
+from lab.simulation.orbit import orbit_camera
 
 ANKLES = [BODY_15.index("lankle"), BODY_15.index("rankle")]
 

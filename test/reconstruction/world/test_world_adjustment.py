@@ -185,7 +185,8 @@ def test_covariances_are_those_of_the_whole_inverse() -> None:
     inverse = np.linalg.inv(np.block([[full, border], [border.T, corner]]))
     found = posterior(matrix, state)
     assert found is not None
-    np.testing.assert_allclose(found.shared, inverse[size:, size:], rtol=1e-5, atol=1e-12)
+    of_place, of_joints, shared = found
+    np.testing.assert_allclose(shared, inverse[size:, size:], rtol=1e-5, atol=1e-12)
     scale = state.globals[SCALE]
     frames, joints = state.joints.shape[:2]
     by = np.zeros((frames, joints, 3, len(inverse)))
@@ -194,10 +195,10 @@ def test_covariances_are_those_of_the_whole_inverse() -> None:
         by[frame, joint, :, at : at + 3] = np.eye(3) / scale
         by[frame, joint, :, size + SCALE] = -state.joints[frame, joint] / scale**2
     mean = by.mean(axis=(0, 1))
-    np.testing.assert_allclose(found.place, mean @ inverse @ mean.T, rtol=1e-4, atol=1e-10)
+    np.testing.assert_allclose(of_place, mean @ inverse @ mean.T, rtol=1e-4, atol=1e-10)
     for frame, joint in ((0, 0), (3, 8), (6, 14), (5, 16)):
         about = by[frame, joint] - mean
-        np.testing.assert_allclose(found.joints[frame, joint], about @ inverse @ about.T, rtol=2e-4, atol=1e-10)
+        np.testing.assert_allclose(of_joints[frame, joint], about @ inverse @ about.T, rtol=2e-4, atol=1e-10)
 
 
 def test_body_scale_yaw_and_latency_are_recovered_from_exact_images() -> None:

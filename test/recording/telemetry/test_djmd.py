@@ -25,8 +25,8 @@ from drocap_ros.motion import load_motion
 from drocap_ros.recording.telemetry.djmd import read_djmd
 from drocap_ros.recording.telemetry.log import Lack, LogLack, camera_poses
 from drocap_ros.recording.telemetry.read import read_telemetry
-from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.tracks import Tracks, load_tracks
+from lab.simulation.capture import simulate_capture
 
 COUNT = 45
 IMAGE_NS = np.round(np.arange(COUNT) * 1e9 / 30).astype(np.int64)

@@ -13,8 +13,8 @@ from drocap_ros.recording.mcap.metadata import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.vehicle.mavlink_vehicle import SampledPath, SimulatedVehicle
+from lab.simulation.capture import simulate_capture
+from lab.simulation.path_vehicle import PathVehicle, SampledPath
 
 HOVER_S = 2.0
 
@@ -41,7 +41,7 @@ def test_camera_of_the_tracks_equals_the_one_of_the_flight(tmp_path, messages):
     with (
         SessionWriter(tmp_path / "s") as writer,
         MavlinkLink(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")) as link,
-        SimulatedVehicle(f"udpout:127.0.0.1:{port}", path) as vehicle,
+        PathVehicle(f"udpout:127.0.0.1:{port}", path) as vehicle,
     ):
         for topic, name in (("/drocap/pose2d", "pose2d"), ("/drocap/vehicle/state", "state")):
             writer.register(topic, NAMES[name], schema_text(NAMES[name]))

@@ -18,10 +18,11 @@ from drocap_ros.simulation.flight_simulator.world import (
     FlightSimulatorConfig,
     FlightWorld,
 )
-from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix
+from drocap_ros.simulation.pinhole import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 from drocap_ros.skeleton import BODY_17
+from lab.simulation.orbit import look_at
 
 ON_GROUND, IN_AIR, TAKING_OFF = 1, 2, 3
 

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.simulation.orbit_camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
+from drocap_ros.simulation.pinhole import pinhole_matrix, project, to_camera
 from drocap_ros.simulation.render.body import body, cones, dress, ellipsoids, joined, rasterize
 from drocap_ros.simulation.render.renderer import Renderer, draw
 from drocap_ros.simulation.render.scenery import make_scenery
 from drocap_ros.simulation.simulated_person import ACTIONS, simulate_person
 from drocap_ros.skeleton import BODY_15
+from lab.simulation.orbit import look_at, orbit_camera
 
 MATRIX = pinhole_matrix(1280, 720, 60)
 LIGHT = np.array([0.0, -1.0, 0.0])

@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.simulation.capture import SimulationConfig, simulate_capture
-from drocap_ros.simulation.keypoint_errors import noisy_keypoints, occlusion
-from drocap_ros.simulation.orbit_camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
+from drocap_ros.simulation.pinhole import pinhole_matrix, project, to_camera
 from drocap_ros.skeleton import BODY_15
+from lab.simulation.capture import SimulationConfig, simulate_capture
+from lab.simulation.keypoint_errors import noisy_keypoints, occlusion
+from lab.simulation.orbit import look_at, orbit_camera
 
 
 def test_camera_points_at_its_target_and_is_level():

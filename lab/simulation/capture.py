@@ -8,11 +8,12 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.parameters import Parameters, param
-from drocap_ros.simulation.keypoint_errors import NoisyKeypoints, detect_person
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
+from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import ACTIONS, simulate_person
 from drocap_ros.skeleton import BODY_15, JointSet
 from drocap_ros.tracks import MAX_FRAMES, Tracks
+from lab.simulation.keypoint_errors import NoisyKeypoints, detect_person
+from lab.simulation.orbit import orbit_camera
 
 
 @dataclass(frozen=True)

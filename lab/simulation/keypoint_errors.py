@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.simulation.orbit_camera import project, to_camera
+from drocap_ros.simulation.pinhole import project, to_camera
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Standard deviation over the box height, per kind of joint (detectors are worst at the ends of the limbs).
@@ -17,8 +17,6 @@ _SPREAD_OF = {name: _SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] 
 _CORRELATION = 0.6
 #: Radius of a limb that occludes.
 _LIMB_RADIUS_M = 0.07
-#: Factor on the noise of occluded joints, which detectors guess.
-_OCCLUDED_NOISE = 2.2
 #: Images per step of the occlusion, for the memory's sake.
 _CHUNK = 4096
 
@@ -126,7 +124,8 @@ def _noisy(
 
     noise_scale, outlier_fraction, missed_fraction = rates
     frames, joints = px.shape[:2]
-    sigma = height[:, None] * np.array([_SPREAD_OF[name] for name in names]) * np.where(hidden, _OCCLUDED_NOISE, 1.0)
+    # Factor on the noise of occluded joints, which detectors guess.
+    sigma = height[:, None] * np.array([_SPREAD_OF[name] for name in names]) * np.where(hidden, 2.2, 1.0)
     white = rng.standard_normal((frames, joints, 2))
     white[1:] *= np.sqrt(1 - _CORRELATION**2)
     noise = lfilter([1.0], [1.0, -_CORRELATION], white, axis=0) if frames > 1 else white

@@ -5,7 +5,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
-from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle, orbit_path
+from lab.simulation.path_vehicle import PathVehicle, orbit_path
 
 ARRIVES_S = 1.3
 QUESTION = mavlink.MAVLink(None, srcSystem=255).timesync_encode(0, 7)
@@ -42,7 +42,7 @@ def answers_of(machine):
 def test_an_answer_is_not_stamped_before_its_question_arrived():
     """On a busy machine it was, by 0.02 s, and counted as a step of the clock."""
     machine = BusyMachine()
-    with SimulatedVehicle(machine, orbit_path(60), boot_s=30.0) as vehicle:
+    with PathVehicle(machine, orbit_path(60), boot_s=30.0) as vehicle:
         vehicle.run(lambda: machine.now_s, seconds=1.5)
     answers = answers_of(machine)
     assert [m.ts1 for m in answers] == [7]
