@@ -22,7 +22,8 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.perception.calibration import CameraModel, camera_model
+from drocap_ros.geometry.lens import CameraModel
+from drocap_ros.perception.calibration import camera_model
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
 from drocap_ros.perception.sources.base import ImageIngestConfig, prefetch
 from drocap_ros.perception.sources.image_files import encode_jpeg
@@ -213,11 +214,11 @@ class ImageIngestNode(ThreadedSource):
             self.count(Key.IMAGES_SKIPPED)
             return
         self._last_ns = frame.stamp_ns
+        if self._camera is not None:  # first: the image's keypoints need its lens
+            self._infos.publish(camera_info_to_ros(header, self._camera))
         if self._images.get_subscription_count():
             data = jpeg or encode_jpeg(frame.image, self.config.jpeg_quality)
             self._images.publish(compressed_image_to_ros(header, data))
-        if self._camera is not None:
-            self._infos.publish(camera_info_to_ros(header, self._camera))
         self.count(Key.IMAGES)
         self.produced(frame.stamp_ns)
         self._arrived_s = time.monotonic()
