@@ -7,6 +7,8 @@ image's header.
 
 from __future__ import annotations
 
+import contextlib
+import os
 import statistics
 import threading
 import time
@@ -31,11 +33,13 @@ from drocap_ros.ros.conversions import background_to_ros, pose2d_to_ros, stamp_f
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.own_process import LoadShedding, LookAhead
+from drocap_ros.ros.shared_images import SharedImages
 from drocap_ros.ros.topics import IMAGE_IN_GRAPH_QOS, publishers_of, subscribers_of
 
 _TOPIC = "image/compressed"
 _DEPTH = 4  # images that may wait
 _BESIDE_LEVEL = 3  # of load shedding, from which on no image waits for the networks,
+_BESIDE_NICENESS = 2  # then: what each image has, and its initial pose, come first
 _SLOW_S = 0.04  # as long as they take longer than this for one: every third would leave too little time for the others
 
 
@@ -166,7 +170,7 @@ class Beside:
     Attributes
     ----------
     looking : held while the networks look at an image
-    seen : stamp of the last image that they looked at here, and the certain subject in it, until it is taken
+    seen : the subject in the last image that they looked at here, until it is taken
     published_ns : stamp of the last image whose keypoints are published
     """
 
@@ -174,7 +178,7 @@ class Beside:
         self._look = node.guarded(_TOPIC, look, stamps=False)
         self._thread = node.thread(self._run, "networks")
         self.looking = threading.Lock()
-        self.seen: tuple[int, PoseObservation | None] | None = None
+        self.seen: PoseObservation | None = None
         self.published_ns = 0
         self._took_s: deque[float] = deque(maxlen=5)
         self._closed = False
@@ -202,6 +206,9 @@ class Beside:
         return lost
 
     def _run(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # not every system has priorities of threads
+            here = os.PRIO_PROCESS, threading.get_native_id()
+            os.setpriority(*here, os.getpriority(*here) + _BESIDE_NICENESS)
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._newest or self._closed)
@@ -235,7 +242,9 @@ class PoseEstimatorNode(ManagedComponent):
         self._roi: np.ndarray | None = None
         self._ahead: LookAhead | None = None
         self._load_shedding = LoadShedding(self.config.max_load_level)
-        self._beside, self._follower = Beside(self, self._look_beside), Follower()
+        self._beside = Beside(self, self._look_beside)
+        self._follower: Follower | None = None
+        self._shared = SharedImages(self)
         self._pose2d = self.output("pose2d")
         self._background = self.output("background")
         self._images = ImageInput(self, self._on_image, _DEPTH)
@@ -291,10 +300,12 @@ class PoseEstimatorNode(ManagedComponent):
         stamp_ns = stamp_from_ros(header.stamp)
         observation = None if self._ahead is None else self._ahead.take(stamp_ns)
         if observation is None:
-            image = image_from_message(sample.message, compressed=True)
+            image = self._shared.get(stamp_ns)
+            image = image_from_message(sample.message, compressed=True) if image is None else image
             if self._load_shedding.lasting == _BESIDE_LEVEL:
                 self._follow(Frame(stamp_ns, image), header)
                 return
+            self._follower = self._beside.seen = None
             observation = self._look(image, stamp_ns, level)
         if level:
             self.count(Key.IMAGES_SHED)
@@ -309,14 +320,17 @@ class PoseEstimatorNode(ManagedComponent):
             if self._estimator.keypoints is not None:
                 self._beside.took(time.perf_counter() - begin_s)
             if looks:
-                self._beside.seen = stamp_ns, observation if self._estimator.certain else None
+                self._beside.seen = observation
         return observation
 
     def _follow(self, frame: Frame, header: Header) -> None:
         """Keypoints by optical flow, at once; the networks look at the newest image when they are done."""
+        if self._follower is None:
+            assert self._estimator is not None
+            self._follower = Follower(self._estimator.hand_over())
         seen, self._beside.seen = self._beside.seen, None
         if seen is not None:
-            self._follower.correct(*seen)
+            self._follower.correct(seen)
         observation = self._follower.follow(frame)
         if observation is not None:
             self._publish(observation, header, propagated=True)

@@ -164,10 +164,10 @@ class PoseEstimator:
         self._flow.start(image if load_level and certain else None, observation)
         return observation, certain
 
-    @property
-    def certain(self) -> bool:
-        """Whether the last image certainly showed the subject."""
-        return self._certain is not None
+    def hand_over(self) -> KeypointFlow:
+        """The optical flow from the last image on, of which this estimator then knows nothing."""
+        flow, self._flow = self._flow, KeypointFlow()
+        return flow
 
     @property
     def propagated(self) -> bool:

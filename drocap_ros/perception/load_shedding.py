@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from typing import TypeVar
 
 import numpy as np
 
@@ -26,8 +25,6 @@ _MAX_ERROR = 2 * _SIGMA  # largest forward-backward error of a joint, which adds
 _MIN_VALID = 0.5  # least share of valid joints; below it the scene changed or the image is blurred
 _LONGEST_S = 0.1  # between the two images: three of 30 Hz
 _MOST_IMAGES = 24  # that pass while the networks look at one: 0.8 s of 30 Hz
-
-Observation = TypeVar("Observation", PoseObservation, PoseObservation | None)
 
 
 class KeypointFlow:
@@ -48,14 +45,14 @@ class KeypointFlow:
         self.steps = 0
         self._keep(image, observation)
 
-    def _keep(self, image: np.ndarray | None, observation: Observation) -> Observation:
+    def _keep(self, image: np.ndarray | None, observation: PoseObservation | None) -> None:
         """Reference for the next image; None without keypoints or with a box too small for the flow's window."""
         self._reference = None
-        if image is not None and observation is not None and np.isfinite(observation.keypoints).any():
-            region, length = _around(observation)
-            if observation.has_subject and (region[2:] - region[:2]).min() > 2 * _WINDOW_PX:
-                self._reference = _view(image, region, length), observation
-        return observation
+        if image is None or observation is None or not np.isfinite(observation.keypoints).any():
+            return
+        region, length = _around(observation)
+        if observation.has_subject and (region[2:] - region[:2]).min() > 2 * _WINDOW_PX:
+            self._reference = _view(image, region, length), observation
 
     def propagate(self, image: np.ndarray, stamp_ns: int) -> PoseObservation | None:
         """The same subject in the next image; None without a reference or with too few valid joints.
@@ -73,7 +70,7 @@ class KeypointFlow:
         region, length = _around(before)
         view = _view(image, region, length)
         if np.array_equal(view, last):  # keypoints of a picture that stands still repeat bit for bit
-            return self._keep(image, dataclasses.replace(before, stamp_ns=stamp_ns))
+            return self._step(image, dataclasses.replace(before, stamp_ns=stamp_ns))
         scale = np.array([view.shape[1], view.shape[0]]) / (region[2:] - region[:2])
         start = ((before.keypoints[known] - region[:2]) * scale).astype(np.float32)
         forward, found = _flow(last, view, start)
@@ -102,15 +99,22 @@ class KeypointFlow:
             confidence=confidence,
             space=None,
         )
+        return self._step(image, observation)
+
+    def _step(self, image: np.ndarray, observation: PoseObservation) -> PoseObservation:
         self.steps += 1
-        return self._keep(image, observation)
+        self._keep(image, observation)
+        return observation
 
 
 class Follower:
-    """Keypoints of every image while the networks look at one of those before."""
+    """Keypoints of every image while the networks look at one of those before.
 
-    def __init__(self) -> None:
-        self._flow = KeypointFlow()
+    flow : with the keypoints of the last image, if they are known
+    """
+
+    def __init__(self, flow: KeypointFlow) -> None:
+        self._flow = flow
         #: From the one on that the networks look at; so many may pass meanwhile.
         self._images: deque[Frame] = deque(maxlen=_MOST_IMAGES)
 
@@ -119,11 +123,11 @@ class Follower:
         self._images.append(frame)
         return self._flow.propagate(frame.image, frame.stamp_ns)
 
-    def correct(self, stamp_ns: int, seen: PoseObservation | None) -> None:
-        """Begin anew from the networks' keypoints in an image that was followed; None = no certain person."""
-        while self._images and self._images[0].stamp_ns < stamp_ns:
+    def correct(self, seen: PoseObservation) -> None:
+        """Begin anew from the networks' keypoints, doubtful ones too, in an image that was followed."""
+        while self._images and self._images[0].stamp_ns < seen.stamp_ns:
             self._images.popleft()
-        if not self._images or self._images[0].stamp_ns != stamp_ns:
+        if not self._images or self._images[0].stamp_ns != seen.stamp_ns:
             return
         first, *later = self._images
         self._flow.start(first.image, seen)
