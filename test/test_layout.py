@@ -29,15 +29,15 @@ BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
      "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "live_replay"): 4.20,  # points of the scene, everybody in pictures; lenses
-    ("perception",): 6.50,  # points of the scene; one who is followed live, and everybody in a recording
+    ("perception",): 6.52,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 12.84,  # one engine, one camera; paths by points, live windows; lenses of joined views (0.09)
-    ("flight",): 9.25,  # a process that holds after the bridge's death; preflight; heights by every source
+    ("flight",): 9.29,  # a process that holds after the bridge's death; preflight, of the machine too; heights
     ("recording",): 6.55,  # keypoints of any order (0.45), tables, GPX, GPMF, several in a log; damaged recordings
     ("simulation",): 3.45,  # reports err as recorded ones
     ("evaluation",): 1.08,  # truth from C3D, TRC and BVH by the names of other programs (0.34), one of several bodies
     ("export", "report", "view"): 4.46,  # OpenSim, USD and FBX (0.17), a report of several persons, the video beside it
-    ("ros", "nodes", "bringup"): 4.52,  # lockstep and processes of their own
-    ("cli",): 4.77,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06, and 0.11 of perception)
+    ("ros", "nodes", "bringup"): 4.77,  # lockstep and processes of their own; networks beside optical flow, shared images
+    ("cli",): 4.83,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06), networks watched (0.05)
     ("lab", "benchmarks"): 11.75,  # flights that are drawn (0.35), mutants of the product (0.17), heights (0.08)
 }  # fmt: skip
 #: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.

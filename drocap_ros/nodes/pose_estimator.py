@@ -293,8 +293,8 @@ class PoseEstimatorNode(ManagedComponent):
 
     def _on_image(self, sample: ImageSample) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
-        level = _BESIDE_LEVEL
-        if not (self._load_shedding.lasting == _BESIDE_LEVEL and self._beside.slow):
+        level = self.config.max_load_level
+        if not (self._load_shedding.lasting >= _BESIDE_LEVEL and self._beside.slow):
             level = self._load_shedding.level(self.now_s(), sample.waited, sample.behind)
         header = sample.message.header
         stamp_ns = stamp_from_ros(header.stamp)
@@ -302,7 +302,7 @@ class PoseEstimatorNode(ManagedComponent):
         if observation is None:
             image = self._shared.get(stamp_ns)
             image = image_from_message(sample.message, compressed=True) if image is None else image
-            if self._load_shedding.lasting == _BESIDE_LEVEL:
+            if self._load_shedding.lasting >= _BESIDE_LEVEL:
                 self._follow(Frame(stamp_ns, image), header)
                 return
             self._follower = self._beside.seen = None
