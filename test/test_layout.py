@@ -36,7 +36,7 @@ BUDGETS = {
     ("simulation",): 3.45,  # reports err as recorded ones
     ("evaluation",): 1.08,  # truth from C3D, TRC and BVH by the names of other programs (0.34), one of several bodies
     ("export", "report", "view"): 4.46,  # OpenSim, USD and FBX (0.17), a report of several persons, the video beside it
-    ("ros", "nodes", "bringup"): 4.77,  # lockstep and processes of their own; networks beside optical flow, shared images
+    ("ros", "nodes", "bringup"): 4.77,  # lockstep, processes of their own; networks beside optical flow, shared images
     ("cli",): 4.83,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06), networks watched (0.05)
     ("lab", "benchmarks"): 11.75,  # flights that are drawn (0.35), mutants of the product (0.17), heights (0.08)
 }  # fmt: skip
