@@ -18,7 +18,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from drocap_ros.flight.mavlink.transport import open_transport
-from drocap_ros.perception.calibration import CameraModel
+from drocap_ros.geometry.lens import CameraModel
 from drocap_ros.ros.component import OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at
 from drocap_ros.ros.diagnostics import PILOT_FLIES, PILOT_HANDS_OFF, Key

@@ -22,7 +22,8 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.perception.calibration import CameraModel, camera_model
+from drocap_ros.geometry.lens import CameraModel
+from drocap_ros.perception.calibration import camera_model
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
 from drocap_ros.perception.sources.base import ImageIngestConfig, prefetch
 from drocap_ros.perception.sources.image_files import encode_jpeg
@@ -31,6 +32,7 @@ from drocap_ros.ros.component import ERROR, OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.lifecycle import ThreadedSource
+from drocap_ros.ros.shared_images import SharedImages
 from drocap_ros.ros.topics import TOPIC_SOURCE
 
 #: An image of a file that is this late when it has been read is dropped: three images at 30 Hz.
@@ -51,6 +53,7 @@ class ImageIngestNode(ThreadedSource):
         """Declare endpoints and state."""
         self._images = self.output("image/compressed")
         self._infos = self.output("camera_info")
+        self._shared = SharedImages(self)
         self._camera: CameraModel | None = None
         self._size: tuple[int, int] | None = None
         self._last_ns: int | None = None
@@ -83,6 +86,7 @@ class ImageIngestNode(ThreadedSource):
         if self._source is not None and self._source.live:
             self._source.close()
         super().release()
+        self._shared.close()
         if self._source is not None:
             self._source.close()
             self._source = None
@@ -213,11 +217,12 @@ class ImageIngestNode(ThreadedSource):
             self.count(Key.IMAGES_SKIPPED)
             return
         self._last_ns = frame.stamp_ns
+        if self._camera is not None:  # first: the image's keypoints need its lens
+            self._infos.publish(camera_info_to_ros(header, self._camera))
         if self._images.get_subscription_count():
+            self._shared.put(frame.stamp_ns, frame.image)
             data = jpeg or encode_jpeg(frame.image, self.config.jpeg_quality)
             self._images.publish(compressed_image_to_ros(header, data))
-        if self._camera is not None:
-            self._infos.publish(camera_info_to_ros(header, self._camera))
         self.count(Key.IMAGES)
         self.produced(frame.stamp_ns)
         self._arrived_s = time.monotonic()

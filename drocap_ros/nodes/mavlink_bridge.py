@@ -30,8 +30,10 @@ from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
 from drocap_ros.flight.orbit.states import Command, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.vehicle import VehicleState, optical_orientation
+from drocap_ros.geometry.lens import CameraModel
 from drocap_ros.msg import OrbitStatus, Pose2D
 from drocap_ros.parameters import Values
+from drocap_ros.recording.pose_messages import lens_of
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode, MessageInfo
 from drocap_ros.ros.conversions import (
     MAP,
@@ -87,7 +89,7 @@ class MavlinkBridgeNode(ComponentNode):
         self._unanswered: list[tuple[OperatorCommand, OrbitCommand.Request, AnswerKey]] = []
         self._last_command: Values = {"command": OrbitStatus.NO_COMMAND}
         self.create_timer(1.0, self._on_second)
-        self._calibrated_size = (0, 0)  # width and height px of camera_info; 0 = not stated
+        self._lens: CameraModel | None = None
         self._stop = threading.Event()
         self._reported: tuple[State, str] | None = None
         self._reported_s = -math.inf
@@ -215,13 +217,14 @@ class MavlinkBridgeNode(ComponentNode):
     def _on_pose2d(self, message: Pose2D, info: MessageInfo) -> None:
         self._rivals.take_pose2d(info["publication_sequence_number"] or 0, self.now_s())
         observation = pose2d_from_ros(message)
-        if all(self._calibrated_size) and observation.image_size != self._calibrated_size:
-            expected, got = (f"{width}x{height}" for width, height in (self._calibrated_size, observation.image_size))
+        calibrated = observation.image_size if self._lens is None else self._lens.size
+        if all(calibrated) and observation.image_size != calibrated:
+            expected, got = (f"{width}x{height}" for width, height in (calibrated, observation.image_size))
             raise InputError(
                 f"pose2d: expected images of {expected} as in camera_info, got {got}: every distance would be wrong; "
                 "publish the camera_info of these images"
             )
-        self.controller.on_pose2d(observation)
+        self.controller.on_pose2d(observation if self._lens is None else self._lens.flat(observation))
         if observation.has_subject:
             self.count(Key.SUBJECT_SEEN)
 
@@ -229,11 +232,14 @@ class MavlinkBridgeNode(ComponentNode):
         self._rivals.take_status(stamp_from_ros(message.header.stamp), self.now_s())
 
     def _on_camera_info(self, message: CameraInfo) -> None:
-        matrix, size = np.array(message.k, dtype=float).reshape(3, 3), (message.width, message.height)
-        if all(size):
-            check_camera_matrix(matrix, size)
-        self.controller.on_camera(matrix)
-        self._calibrated_size = size
+        lens, unknown = lens_of(message)
+        assert lens is not None, "a message of ROS 2 has nine numbers"
+        if all(lens.size):
+            check_camera_matrix(lens.matrix, lens.size)
+        self.controller.on_camera(lens.matrix)
+        self._lens = lens
+        if unknown:
+            raise InputError(unknown)
 
     def _on_second(self) -> None:
         if self._guardian is not None:

@@ -7,6 +7,9 @@ image's header.
 
 from __future__ import annotations
 
+import contextlib
+import os
+import statistics
 import threading
 import time
 from collections import deque
@@ -16,9 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 from sensor_msgs.msg import CompressedImage, RegionOfInterest
+from std_msgs.msg import Header
 
+from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
+from drocap_ros.perception.load_shedding import Follower
+from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import OK, WARN, ComponentNode, Gaps, Line, MessageInfo
@@ -26,10 +33,14 @@ from drocap_ros.ros.conversions import background_to_ros, pose2d_to_ros, stamp_f
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.own_process import LoadShedding, LookAhead
+from drocap_ros.ros.shared_images import SharedImages
 from drocap_ros.ros.topics import IMAGE_IN_GRAPH_QOS, publishers_of, subscribers_of
 
 _TOPIC = "image/compressed"
 _DEPTH = 4  # images that may wait
+_BESIDE_LEVEL = 3  # of load shedding, from which on no image waits for the networks,
+_BESIDE_NICENESS = 2  # then: what each image has, and its initial pose, come first
+_SLOW_S = 0.04  # as long as they take longer than this for one: every third would leave too little time for the others
 
 
 class ImageSample(NamedTuple):
@@ -151,6 +162,70 @@ class ImageInput:
             self._process_now(sample)
 
 
+class Beside:
+    """Where images queue all the same: a thread of the networks' own, for the newest image.
+
+    look : looks at a frame, with its header and whether its keypoints are published
+
+    Attributes
+    ----------
+    looking : held while the networks look at an image
+    seen : the subject in the last image that they looked at here, until it is taken
+    published_ns : stamp of the last image whose keypoints are published
+    """
+
+    def __init__(self, node: ComponentNode, look: Callable[[Frame, Header, bool], None]) -> None:
+        self._look = node.guarded(_TOPIC, look, stamps=False)
+        self._thread = node.thread(self._run, "networks")
+        self.looking = threading.Lock()
+        self.seen: PoseObservation | None = None
+        self.published_ns = 0
+        self._took_s: deque[float] = deque(maxlen=5)
+        self._closed = False
+        self._newest: tuple[Frame, Header, bool] | None = None
+        self._changed = threading.Condition()
+
+    def took(self, seconds: float) -> None:
+        """Record how long the networks took for an image."""
+        self._took_s.append(seconds)
+
+    @property
+    def slow(self) -> bool:
+        """Whether the networks take too long for images to wait for them."""
+        return bool(self._took_s) and statistics.median(tuple(self._took_s)) > _SLOW_S
+
+    def offer(self, frame: Frame, header: Header, published: bool) -> bool:
+        """Put an image in the place of the one that waits; whether that had no keypoints, and will have none."""
+        with self._changed:
+            lost = self._newest is not None and not self._newest[2]
+            self.published_ns = frame.stamp_ns if published else self.published_ns
+            self._newest = frame, header, published
+            self._changed.notify_all()
+        if not self._thread.is_alive():
+            self._thread.start()
+        return lost
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # not every system has priorities of threads
+            here = os.PRIO_PROCESS, threading.get_native_id()
+            os.setpriority(*here, os.getpriority(*here) + _BESIDE_NICENESS)
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._newest or self._closed)
+                newest, self._newest = self._newest, None
+            if newest is None or self._closed:
+                return
+            self._look(*newest)
+
+    def close(self) -> None:
+        """Look at no more images."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+
+
 class PoseEstimatorNode(ManagedComponent):
     """Runs detection, subject tracking and 2D pose on images, with less work for each while they queue.
 
@@ -167,6 +242,9 @@ class PoseEstimatorNode(ManagedComponent):
         self._roi: np.ndarray | None = None
         self._ahead: LookAhead | None = None
         self._load_shedding = LoadShedding(self.config.max_load_level)
+        self._beside = Beside(self, self._look_beside)
+        self._follower: Follower | None = None
+        self._shared = SharedImages(self)
         self._pose2d = self.output("pose2d")
         self._background = self.output("background")
         self._images = ImageInput(self, self._on_image, _DEPTH)
@@ -183,7 +261,8 @@ class PoseEstimatorNode(ManagedComponent):
         """Drop the networks and the subject."""
         self._images.wait_idle()
         self._end_ahead()
-        self._estimator, self._roi = None, None
+        with self._beside.looking:
+            self._estimator, self._roi = None, None
 
     def expect(self, stamp_ns: int, jpeg: Future[bytes]) -> None:
         """Look at a picture that will be published."""
@@ -209,25 +288,72 @@ class PoseEstimatorNode(ManagedComponent):
     def close(self) -> None:
         """Process no more images."""
         self._images.close()
+        self._beside.close()
         self._end_ahead()
 
     def _on_image(self, sample: ImageSample) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
-        level = self._load_shedding.level(self.now_s(), sample.waited, sample.behind)
+        level = self.config.max_load_level
+        if not (self._load_shedding.lasting >= _BESIDE_LEVEL and self._beside.slow):
+            level = self._load_shedding.level(self.now_s(), sample.waited, sample.behind)
         header = sample.message.header
         stamp_ns = stamp_from_ros(header.stamp)
         observation = None if self._ahead is None else self._ahead.take(stamp_ns)
         if observation is None:
-            roi, self._roi = self._roi, None
-            image = image_from_message(sample.message, compressed=True)
-            observation = self._estimator.process(image, stamp_ns, roi, level)
+            image = self._shared.get(stamp_ns)
+            image = image_from_message(sample.message, compressed=True) if image is None else image
+            if self._load_shedding.lasting >= _BESIDE_LEVEL:
+                self._follow(Frame(stamp_ns, image), header)
+                return
+            self._follower = self._beside.seen = None
+            observation = self._look(image, stamp_ns, level)
         if level:
             self.count(Key.IMAGES_SHED)
-        if self._estimator.propagated:
+        self._publish(observation, header, propagated=self._estimator.propagated)
+
+    def _look(self, image: np.ndarray, stamp_ns: int, level: int, *, looks: bool = False) -> PoseObservation:
+        roi, self._roi = self._roi, None
+        with self._beside.looking:
+            assert self._estimator is not None
+            begin_s = time.perf_counter()
+            observation = self._estimator.process(image, stamp_ns, roi, level, looks=looks)
+            if self._estimator.keypoints is not None:
+                self._beside.took(time.perf_counter() - begin_s)
+            if looks:
+                self._beside.seen = observation
+        return observation
+
+    def _follow(self, frame: Frame, header: Header) -> None:
+        """Keypoints by optical flow, at once; the networks look at the newest image when they are done."""
+        if self._follower is None:
+            assert self._estimator is not None
+            self._follower = Follower(self._estimator.hand_over())
+        seen, self._beside.seen = self._beside.seen, None
+        if seen is not None:
+            self._follower.correct(seen)
+        observation = self._follower.follow(frame)
+        if observation is not None:
+            self._publish(observation, header, propagated=True)
+        if self._beside.offer(frame, header, published=observation is not None):
+            self.missed(_TOPIC, 1)
+
+    def _look_beside(self, frame: Frame, header: Header, published: bool) -> None:
+        if self._estimator is None:
+            return
+        observation = self._look(frame.image, frame.stamp_ns, self.config.max_load_level, looks=True)
+        self.count(Key.IMAGES_SHED)
+        if published:
+            self._publish_points(observation, header)
+        elif frame.stamp_ns > self._beside.published_ns:
+            self._publish(observation, header)
+        else:
+            self.missed(_TOPIC, 1)
+
+    def _publish(self, observation: PoseObservation, header: Header, *, propagated: bool = False) -> None:
+        if propagated:
             self.count(Key.IMAGES_PROPAGATED)
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
-        if observation.background is not None and (not self.peers or subscribers_of("background", self.peers)):
-            self._background.publish(background_to_ros(observation.background, header))
+        self._publish_points(observation, header)
         self.count(Key.IMAGES)
         self.produced(observation.stamp_ns)
         if observation.has_subject:
@@ -238,3 +364,7 @@ class PoseEstimatorNode(ManagedComponent):
         else:
             self.details[Key.SUBJECT] = "none"
             self.report(WARN, "no subject in view")
+
+    def _publish_points(self, observation: PoseObservation, header: Header) -> None:
+        if observation.background is not None and (not self.peers or subscribers_of("background", self.peers)):
+            self._background.publish(background_to_ros(observation.background, header))

@@ -4,76 +4,17 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
+from drocap_ros.geometry.lens import LENS_MODELS, CameraModel, coefficients_of
 from drocap_ros.geometry.rotations import centred_camera
 from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.tracks import Tracks, check_camera_matrix
-
-#: Names of lens distortions that ``sensor_msgs/CameraInfo`` knows (``distortion_models.hpp`` of sensor_msgs).
-LENS_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
-LENS_COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of them
-
-
-@dataclass(frozen=True)
-class CameraModel:
-    """Pinhole camera with lens distortion, as in ``sensor_msgs/CameraInfo``.
-
-    width, height : px
-    matrix : (3, 3) px
-    distortion : coefficients of the named model, empty for an ideal lens
-    """
-
-    width: int
-    height: int
-    matrix: np.ndarray
-    distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    distortion_model: str = "plumb_bob"
-
-    def has_aspect_of(self, size: tuple[int, int]) -> bool:
-        """Whether images of ``size`` (width, height) px have the calibration's aspect ratio, to 2 %."""
-        return abs(self.width * size[1] - self.height * size[0]) <= 0.02 * self.width * size[1]
-
-    def undistorted(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 2) px as a lens without distortion shows them; NaN stays."""
-        import cv2
-
-        seen, flat = np.isfinite(points).all(axis=1), np.full(points.shape, np.nan)
-        if seen.any():
-            undo = cv2.fisheye.undistortPoints if self.distortion_model == "equidistant" else cv2.undistortPoints
-            given = points[seen].astype(np.float64)[:, None]
-            flat[seen] = undo(given, self.matrix, self.distortion, P=self.matrix)[:, 0]
-        return flat
-
-    def yaml(self, name: str) -> str:
-        """Text of a file as ROS's ``camera_calibration`` writes it."""
-        import yaml
-
-        def table(rows: int, columns: int, values: np.ndarray) -> dict[str, object]:
-            return {"rows": rows, "cols": columns, "data": [round(float(v), 8) for v in values.ravel()]}
-
-        projection = np.column_stack([self.matrix, np.zeros(3)])
-        content = {
-            "image_width": self.width,
-            "image_height": self.height,
-            "camera_name": name,
-            "camera_matrix": table(3, 3, self.matrix),
-            "distortion_model": self.distortion_model,
-            "distortion_coefficients": table(1, len(self.distortion), self.distortion),
-            "rectification_matrix": table(3, 3, np.eye(3)),
-            "projection_matrix": table(3, 4, projection),
-        }
-        return str(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-
-    def resized(self, width: int, height: int) -> CameraModel:
-        """The same lens at another image size."""
-        scale = np.array([width / self.width, height / self.height, 1.0])
-        return CameraModel(width, height, self.matrix * scale[:, None], self.distortion, self.distortion_model)
 
 
 def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraModel | None:
@@ -134,8 +75,9 @@ def load_calibration(path: Path) -> CameraModel:
         )
     if min(model.width, model.height) < 1:
         raise InputError(f"{path}: expected a positive image size, found {model.width}x{model.height}; correct it")
-    if not np.isfinite(distortion).all() or len(distortion) not in (0, *LENS_COEFFICIENTS):
-        raise InputError(f"{path}: expected 4, 5, 8, 12 or 14 finite distortion coefficients, found {distortion}")
+    if not np.isfinite(distortion).all() or len(distortion) not in (0, *coefficients_of(lens)):
+        counts = " or ".join(map(str, coefficients_of(lens)))
+        raise InputError(f"{path}: expected {counts} finite distortion coefficients of {lens}, found {distortion}")
     try:
         check_camera_matrix(matrix, (model.width, model.height))
     except InputError as error:
@@ -177,10 +119,7 @@ def with_lens_of(tracks: Tracks, config: ImageIngestConfig) -> Tracks:
 
 def through_lens(tracks: Tracks, camera: CameraModel) -> Tracks:
     """Tracks with a lens, whose distortion is taken off keypoints and points."""
-    background = tracks.background
     if camera.distortion.any():
         flat = camera.undistorted(tracks.keypoints.reshape(-1, 2)).reshape(tracks.keypoints.shape)
-        if background is not None:
-            background = replace(background, point=camera.undistorted(background.point).astype(background.point.dtype))
-        tracks = replace(tracks, keypoints=flat, background=background)
+        tracks = replace(tracks, keypoints=flat, background=camera.flat_points(tracks.background))
     return replace(tracks, camera_matrix=camera.matrix)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.lens import CameraModel
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.perception.sources import Frame
 
 #: Most views that are used, and least: five parameters of distortion and four of the lens need some turns.

@@ -86,6 +86,8 @@ class PoseEstimator:
         roi: np.ndarray | None = None,
         load_level: int = 0,
         ahead: Frame | None = None,
+        *,
+        looks: bool = False,
     ) -> PoseObservation:
         """The subject in one image.
 
@@ -98,6 +100,7 @@ class PoseEstimator:
             for ``load_level`` images, doubled at each further failure up to four times that, unless the detection is
             clear; from 2 on the scene's points are followed ten times a second
         ahead : the next image, whose scene another thread follows meanwhile; the results are the same without it
+        looks : no keypoints by optical flow, whatever the level
         """
         roi = _validated_roi(roi)
         scene = self.begin(image, stamp_ns, ahead, seldom=load_level > 1)
@@ -105,6 +108,8 @@ class PoseEstimator:
         if scene.again and self._certain is not None and roi is None:
             observation = dataclasses.replace(self._certain, stamp_ns=stamp_ns)
         else:
+            if looks:
+                self._flow.start(None, None)
             observation, certain = self._observe(image, stamp_ns, roi, load_level)
             self._certain = observation if certain else None
         self.end()
@@ -158,6 +163,11 @@ class PoseEstimator:
         # Doubtful persons are not propagated by optical flow; the detector runs again.
         self._flow.start(image if load_level and certain else None, observation)
         return observation, certain
+
+    def hand_over(self) -> KeypointFlow:
+        """The optical flow from the last image on, of which this estimator then knows nothing."""
+        flow, self._flow = self._flow, KeypointFlow()
+        return flow
 
     @property
     def propagated(self) -> bool:

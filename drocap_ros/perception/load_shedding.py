@@ -8,11 +8,13 @@ repeatability: median 0.3 to 0.6 % of the box, 1 to 2 % at the 90th percentile.
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 
 import numpy as np
 
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.models.network_input import shrink
+from drocap_ros.perception.sources.base import Frame
 
 _SIDE_PX = 192  # longer side of the box in the flow's image; smaller boxes are not enlarged
 _MARGIN = 0.25  # around the box, share of its longer side
@@ -22,6 +24,7 @@ _SIGMA = 0.005  # standard deviation that each step adds, share of the box's lon
 _MAX_ERROR = 2 * _SIGMA  # largest forward-backward error of a joint, which adds to it, same unit
 _MIN_VALID = 0.5  # least share of valid joints; below it the scene changed or the image is blurred
 _LONGEST_S = 0.1  # between the two images: three of 30 Hz
+_MOST_IMAGES = 24  # that pass while the networks look at one: 0.8 s of 30 Hz
 
 
 class KeypointFlow:
@@ -66,6 +69,8 @@ class KeypointFlow:
         known = np.isfinite(before.keypoints).all(axis=1)
         region, length = _around(before)
         view = _view(image, region, length)
+        if np.array_equal(view, last):  # keypoints of a picture that stands still repeat bit for bit
+            return self._step(image, dataclasses.replace(before, stamp_ns=stamp_ns))
         scale = np.array([view.shape[1], view.shape[0]]) / (region[2:] - region[:2])
         start = ((before.keypoints[known] - region[:2]) * scale).astype(np.float32)
         forward, found = _flow(last, view, start)
@@ -94,9 +99,40 @@ class KeypointFlow:
             confidence=confidence,
             space=None,
         )
+        return self._step(image, observation)
+
+    def _step(self, image: np.ndarray, observation: PoseObservation) -> PoseObservation:
         self.steps += 1
         self._keep(image, observation)
         return observation
+
+
+class Follower:
+    """Keypoints of every image while the networks look at one of those before.
+
+    flow : with the keypoints of the last image, if they are known
+    """
+
+    def __init__(self, flow: KeypointFlow) -> None:
+        self._flow = flow
+        #: From the one on that the networks look at; so many may pass meanwhile.
+        self._images: deque[Frame] = deque(maxlen=_MOST_IMAGES)
+
+    def follow(self, frame: Frame) -> PoseObservation | None:
+        """The subject in the next image; None where too little of it is known or found."""
+        self._images.append(frame)
+        return self._flow.propagate(frame.image, frame.stamp_ns)
+
+    def correct(self, seen: PoseObservation) -> None:
+        """Begin anew from the networks' keypoints, doubtful ones too, in an image that was followed."""
+        while self._images and self._images[0].stamp_ns < seen.stamp_ns:
+            self._images.popleft()
+        if not self._images or self._images[0].stamp_ns != seen.stamp_ns:
+            return
+        first, *later = self._images
+        self._flow.start(first.image, seen)
+        for frame in later:
+            self._flow.propagate(frame.image, frame.stamp_ns)
 
 
 def _around(observation: PoseObservation) -> tuple[np.ndarray, float]:

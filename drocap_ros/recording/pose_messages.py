@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -10,8 +11,9 @@ from drocap_ros.background import Background, FixedPoints, of_images
 from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle import optical_orientation
 from drocap_ros.geometry.camera_history import CameraHistory
+from drocap_ros.geometry.lens import LENS_MODELS, CameraModel, coefficients_of
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.recording.session import Message, Session, calibration_of, header_stamp_ns, xyzw_of
+from drocap_ros.recording.session import Message, Session, header_stamp_ns, numbers_of, xyzw_of
 from drocap_ros.skeleton import joint_set
 from drocap_ros.stamps import StampValidator
 from drocap_ros.tracks import check_camera_matrix, check_keypoints
@@ -82,13 +84,30 @@ def add_state(history: CameraHistory, message: Message) -> None:
 
 
 def add_calibration(history: CameraHistory, message: Message) -> None:
-    """Give a camera's history a ``CameraInfo``; an uncalibrated one changes nothing."""
-    matrix = calibration_of(message)
-    if matrix is not None:
-        size = (message.width, message.height)
-        if matrix[0, 0] > 0 and min(size) > 0:
-            check_camera_matrix(matrix, size)
-        history.add_matrix(header_stamp_ns(message), matrix, size)
+    """Give a camera's history a ``CameraInfo``; an uncalibrated one changes nothing.
+
+    Where its distortion is of no known form the lens counts without it, and an InputError says so.
+    """
+    lens, unknown = lens_of(message)
+    if lens is not None:
+        if lens.matrix[0, 0] > 0 and min(lens.width, lens.height) > 0:
+            check_camera_matrix(lens.matrix, (lens.width, lens.height))
+        history.add_lens(header_stamp_ns(message), lens)
+    if unknown:
+        raise InputError(unknown)
+
+
+def lens_of(message: Message) -> tuple[CameraModel | None, str]:
+    """The lens of a ``CameraInfo``, None where it holds no matrix; and in words what of it has no known form."""
+    matrix, found, model = numbers_of(message, "k"), numbers_of(message, "d"), str(message.distortion_model)
+    if matrix.size != 9:
+        return None, ""
+    lens = CameraModel(int(message.width), int(message.height), matrix.reshape(3, 3))
+    if not found.any():
+        return lens, ""
+    if model not in LENS_MODELS or found.size not in coefficients_of(model) or not np.isfinite(found).all():
+        return lens, f"the distortion ({model[:40]!r}, {found.size} values) is of no known form: not used"
+    return dataclasses.replace(lens, distortion=found, distortion_model=model), ""
 
 
 def float_array(values: Sequence[float] | np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -179,11 +179,9 @@ def header_stamp_ns(message: Message) -> int:
     return stamp_of(message.header.stamp if hasattr(message, "header") else message.timestamp)
 
 
-def calibration_of(message: Message) -> np.ndarray | None:
-    """(3, 3) px of a ``CameraInfo``; None where it holds no matrix."""
-    # ROS 2 names the matrix k, ROS 1 names it K.
-    matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), dtype=np.float64)
-    return matrix.reshape(3, 3) if matrix.size == 9 else None
+def numbers_of(message: Message, name: str) -> np.ndarray:
+    """(N,) a field by the name of ROS 2, or of ROS 1, in capitals; empty where there is none."""
+    return np.asarray(getattr(message, name, getattr(message, name.upper(), ())), np.float64)
 
 
 def xyzw_of(quaternion: Message) -> np.ndarray:

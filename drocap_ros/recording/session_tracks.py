@@ -10,12 +10,13 @@ from collections.abc import Iterable
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.lens import CameraModel
 from drocap_ros.geometry.rotations import unit_quaternions
-from drocap_ros.perception.calibration import LENS_COEFFICIENTS, LENS_MODELS, CameraModel, through_lens
+from drocap_ros.perception.calibration import through_lens
 from drocap_ros.recording import session as recorded
 from drocap_ros.recording.other_poses import read_other_poses
-from drocap_ros.recording.pose_messages import float_array, read_fixed_points
-from drocap_ros.recording.session import Message, Session, TopicInfo, calibration_of, header_stamp_ns, xyzw_of
+from drocap_ros.recording.pose_messages import float_array, lens_of, read_fixed_points
+from drocap_ros.recording.session import Message, Session, TopicInfo, header_stamp_ns, numbers_of, xyzw_of
 from drocap_ros.recording.telemetry.log import VehicleTrack, with_camera
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
@@ -189,15 +190,22 @@ def _first_calibration(session: Session, topic: str, size: tuple[int, int], *, r
     """
     camera: CameraModel | None = None
     for _, message in session.messages((topic,)):
-        matrix = calibration_of(message)
-        if rectified and (projection := np.asarray(_either(message, "p", ()), np.float64)).size == 12:
-            matrix = projection.reshape(3, 4)[:, :3] if projection.any() else matrix
-        if matrix is None or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+        lens, unknown = lens_of(message)
+        if lens is None:
+            continue
+        matrix, distortion = lens.matrix, lens.distortion
+        if rectified:
+            distortion, projection = distortion[:0], numbers_of(message, "p")
+            matrix = projection.reshape(3, 4)[:, :3] if projection.size == 12 and projection.any() else matrix
+        if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
             continue
         if camera is None:
-            camera = CameraModel(message.width or size[0], message.height or size[1], matrix)
-            if not rectified:
-                camera = _distorted(session, topic, camera, message)
+            width, height = lens.width or size[0], lens.height or size[1]
+            camera = CameraModel(width, height, matrix, distortion, lens.distortion_model)
+            if unknown and not rectified:
+                session.warn(f"{topic}: {unknown}")
+            if distortion.any():
+                session.warn(f"the distortion of the lens on {topic} is taken off the keypoints")
             part = message.roi
             if (part.width, part.height) == size != (camera.width, camera.height):
                 moved = camera.matrix - [[0, 0, part.x_offset], [0, 0, part.y_offset], [0, 0, 0]]
@@ -207,23 +215,6 @@ def _first_calibration(session: Session, topic: str, size: tuple[int, int], *, r
             session.warn(f"the calibration on {topic} changes: the first one is used; cut the recording there")
             break
     return camera
-
-
-def _distorted(session: Session, topic: str, camera: CameraModel, message: Message) -> CameraModel:
-    """The lens with the distortion that a message states."""
-    found, model = np.asarray(_either(message, "d", ()), np.float64), str(message.distortion_model)
-    if not found.any():
-        return camera
-    if model not in LENS_MODELS or found.size not in LENS_COEFFICIENTS or not np.isfinite(found).all():
-        session.warn(f"the distortion on {topic} ({model[:40]!r}, {found.size} values) is of no known form: not used")
-        return camera
-    session.warn(f"the distortion of the lens on {topic} is taken off the keypoints")
-    return dataclasses.replace(camera, distortion=found, distortion_model=model)
-
-
-def _either(message: Message, name: str, otherwise: object) -> object:
-    """A field by the name of ROS 2, or of ROS 1, in capitals."""
-    return getattr(message, name, getattr(message, name.upper(), otherwise))
 
 
 def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:

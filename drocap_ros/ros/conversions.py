@@ -14,10 +14,10 @@ from std_msgs.msg import Header
 
 from drocap_ros.background import FixedPoints
 from drocap_ros.flight.vehicle import VehicleState as VehicleStateData
+from drocap_ros.geometry.lens import CameraModel
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
-from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.reconstruction.live.initializer import LivePose
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
 from drocap_ros.recording.pose_messages import float_array, observation_from_message

@@ -40,6 +40,11 @@ class LoadShedding:
         self._queued_s = -math.inf
         self._raised_s = -math.inf
 
+    @property
+    def lasting(self) -> int:
+        """Level without what the backlog of the moment adds."""
+        return self._level
+
     def level(self, now_s: float, queued: bool, backlog: int) -> int:
         """Level for the current image.
 

@@ -97,7 +97,7 @@ NODES: dict[str, NodeEntry] = {
     "image_ingest": NodeEntry(("image/compressed", "camera_info"), source=True, live=True),
     "flight_simulator": NodeEntry(("image/compressed", "camera_info"), source=True),
     "pose_estimator": NodeEntry(("pose2d", "background"), ("image/compressed", "roi"), live=True),
-    "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
+    "initializer": NodeEntry(("pose3d/initial",), ("pose2d", "camera_info"), live=True),
     "bundle_adjuster": NodeEntry(
         ("pose3d/refined", "pose3d/latest", *_TF),
         ("pose2d", "pose3d/initial", "background", "vehicle/state", "camera_info"),

@@ -20,7 +20,7 @@ from station_files import station_settings
 
 from drocap_ros.bringup import free_domain
 from drocap_ros.cli import main
-from drocap_ros.cli.graph.preflight import look, setup_of
+from drocap_ros.cli.graph.preflight import look, pace_of, setup_of
 from drocap_ros.cli.graph.running_bridge import BridgeListener
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
@@ -29,7 +29,7 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.measure import all_findings
-from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
+from drocap_ros.flight.preflight.setup_checks import Pace, Pictures, Setup, setup_findings
 from drocap_ros.flight.vehicle import LANDED_ON_GROUND, VehicleState
 from drocap_ros.perception.sources import Frame, ImageSource
 from drocap_ros.perception.sources.base import ImageIngestConfig
@@ -279,6 +279,54 @@ def test_a_covered_lens_is_named(tmp_path):
     assert check.level == Level.WARNING
     assert "all of one colour" in check.found
     assert "uncover the lens" in check.remedy
+
+
+class Networks:
+    """Take so many seconds for an image, and let optical flow follow the others of load shedding."""
+
+    def __init__(self, seconds):
+        self.seconds, self.propagated, self.levels, self.since = seconds, False, [], 0
+
+    def process(self, image, stamp_ns, load_level):
+        self.levels.append(load_level)
+        self.propagated = self.since < load_level
+        self.since = self.since + 1 if self.propagated else 0
+        time.sleep(0.0 if self.propagated else self.seconds)
+
+
+@pytest.mark.parametrize(("work_s", "passes"), [(0.001, False), (0.9, True)])
+def test_the_networks_are_watched_on_the_images_of_the_source(tmp_path, monkeypatch, work_s, passes):
+    for number in range(90):
+        cv2.imwrite(str(tmp_path / f"{number:03}.png"), np.full((48, 64, 3), number, np.uint8))
+    config = DrocapConfig().replace("image_ingest", source=str(tmp_path), folder_rate_hz=20.0)
+    networks = Networks(work_s)
+    monkeypatch.setattr("drocap_ros.perception.estimator.PoseEstimator", lambda *_: networks)
+    monkeypatch.setattr("drocap_ros.cli.graph.preflight._PACE_S", 4.0)
+    pace = pace_of(config, Path("models"), 20.0, lambda *_: None)
+    assert 3.5 < pace.seconds <= 4.0
+    assert pace.pixels == 48 * 64
+    assert pace.every >= 1.0
+    assert pace.passed_over > 0.5 if passes else pace.passed_over < 0.4  # a busy machine passes over some
+    assert (max(networks.levels) > 0) or not passes
+
+
+@pytest.mark.parametrize(
+    ("pace", "level", "words"),
+    [
+        ((0.0, 1.4, 1280 * 720, 1, 2), Level.OK, ()),
+        ((0.0, 3.6, 1280 * 720, 1, 2), Level.WARNING, ("max_rate_hz to 17", "smaller one")),
+        ((0.2, 3.0, 1920 * 1080, 1, 8), Level.WARNING, ("max_rate_hz to 16", "width_px", "threads to 4")),
+        ((0.8, 1.0, 1280 * 720, 4, 8), Level.MISSING, ("max_rate_hz to 6", "smaller one")),
+    ],
+)
+def test_a_machine_that_does_not_keep_up_is_told_which_setting_to_change(pace, level, words):
+    setup = setup_of(DrocapConfig().replace("image_ingest", source="x"))
+    pictures = Pictures(size=(1280, 720), rate_hz=30.0, pace=Pace(10.0, *pace))
+    found = {f.code: f for f in setup_findings(MavlinkBridgeConfig(), setup._replace(pictures=pictures))}["pace"]
+    assert found.level == level
+    assert found.found.startswith("keeps up with 30" if pace[0] == 0 else f"passes over {100 * pace[0]:.0f}% of 30")
+    assert all(word in found.remedy for word in words)
+    assert bool(found.remedy) == bool(words)
 
 
 def test_the_images_of_a_topic_come_from_the_graph():

@@ -110,7 +110,7 @@ def test_memory_is_bounded_and_a_window_stays_whole() -> None:
         if i % 1000 == 0:
             history.add_matrix(i * S // 50, scaled(1.0 + i))
     assert len(history._stamps) < 500
-    assert len(history._matrices) <= 20
+    assert len(history._lenses) <= 20
     end = 99_999 / 50
     camera = history.along(at(end - 2.0, end - 1.0, end))
     assert camera is not None

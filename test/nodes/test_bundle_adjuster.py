@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from bent_lenses import BENT, bent
 from telemetry_stream import orbit
 
 from drocap_ros.background import FixedPoints
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.vehicle import OPTICAL_FROM_FLU, VehicleState
+from drocap_ros.geometry.lens import CameraModel
 from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.live_replay import reconstruct_live, recorded_config
-from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.reconstruction.live.initializer import LivePose
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import (
@@ -31,6 +34,7 @@ from drocap_ros.ros.topics import TOPICS
 from lab.simulation.capture import simulate_capture
 
 NODES = ("initializer", "bundle_adjuster", "session_recorder")
+LENS = "rational_polynomial"
 S = 10**9
 BEGIN = 1_790_000_000 * S
 
@@ -51,12 +55,15 @@ def observed(seconds, track_id=1, begin_ns=BEGIN, seed=0):
 
 
 def fly(folder, flown, states_until_ns):
-    """An orbit's topics through a recorded graph, its vehicle's states up to a time; gives what was published."""
+    """An orbit's topics through a recorded graph, its vehicle's states up to a time; gives what was published.
+
+    The lens bends what it shows: poses and paths have to be as accurate as those of an ideal one.
+    """
     config = DrocapConfig().replace("session_recorder", session_dir=str(folder))
     # A busy machine takes its time here, instead of every fourth image.
     config = config.replace("bundle_adjuster", max_solve_s=5.0)
     seen = {topic: [] for topic in ("pose3d/latest", "pose3d/refined", "/tf", "/diagnostics")}
-    camera = CameraModel(*flown.observations[0].image_size, flown.matrix)
+    camera = CameraModel(*flown.observations[0].image_size, flown.matrix, np.array(BENT[LENS]), LENS)
     gimbal = quaternion_from_matrix(np.swapaxes(OPTICAL_FROM_FLU.T @ flown.rotation, 1, 2))
     with bringup(config, NODES) as graph:
         for topic, messages in seen.items():
@@ -66,7 +73,7 @@ def fly(folder, flown, states_until_ns):
             for topic in ("pose2d", "vehicle/state", "camera_info", "background")
         }
         graph.wait_until(
-            lambda: [p.get_subscription_count() for p in publish.values()] == [3, 2, 2, 2], 20, "the nodes to listen"
+            lambda: [p.get_subscription_count() for p in publish.values()] == [3, 2, 3, 2], 20, "the nodes to listen"
         )
         for i, observation in enumerate(flown.observations):
             stamp_ns = observation.stamp_ns
@@ -74,10 +81,12 @@ def fly(folder, flown, states_until_ns):
                 state = VehicleState(stamp_ns, position_enu_m=flown.position[i], gimbal_orientation_xyzw=gimbal[i])
                 publish["vehicle/state"].publish(vehicle_state_to_ros(state))
             header, here = header_at(stamp_ns, "camera"), flown.background.frame == i
-            points = FixedPoints(flown.background.track[here], flown.background.point[here])
+            point = bent(flown.background.point[here], flown.matrix, LENS).astype(np.float32)
+            points = FixedPoints(flown.background.track[here], point)
+            shown = bent(observation.keypoints, flown.matrix, LENS).astype(np.float32)
             publish["camera_info"].publish(camera_info_to_ros(header, camera))
             publish["background"].publish(background_to_ros(points, header))
-            publish["pose2d"].publish(pose2d_to_ros(observation, "camera"))
+            publish["pose2d"].publish(pose2d_to_ros(replace(observation, keypoints=shown), "camera"))
             graph.spin_for(0.066)
         last_ns = flown.observations[-1].stamp_ns
         graph.wait_until(

@@ -16,8 +16,8 @@ from sensor_msgs.msg import CompressedImage, RegionOfInterest
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.geometry.lens import CameraModel
 from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, VehicleState
-from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.ros.conversions import camera_info_to_ros, header_at, stamp_to_ros
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from bent_lenses import BENT, bent
 
 from drocap_ros.background import Background
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.lens import CameraModel
 from drocap_ros.motion import load_motion
 from drocap_ros.perception.calibration import load_calibration, with_lens_of
 from drocap_ros.perception.sources.base import ImageIngestConfig
@@ -18,7 +19,6 @@ from drocap_ros.tracks import Tracks, save_tracks
 
 SIZE = (1280, 720)
 MATRIX = np.array([[900.0, 0.0, 650.0], [0.0, 905.0, 350.0], [0.0, 0.0, 1.0]])
-BENT = {"plumb_bob": [-0.2, 0.05, 0.001, -0.001, 0.0], "equidistant": [0.02, -0.01, 0.002, 0.0]}
 FLAT = ", ".join(map(str, MATRIX.ravel()))
 
 
@@ -46,13 +46,6 @@ def toml(lens: str, names: tuple[str, ...] = ("cam_1",)) -> str:
     return "".join(f"[{name}]\n{table}" for name in names) + "[metadata]\nerror = 0.0\n"
 
 
-def bent(points: np.ndarray, lens: str) -> np.ndarray:
-    """Points (N, 2) px of an ideal lens as this one shows them."""
-    rays = np.concatenate([(points - MATRIX[:2, 2]) / np.diagonal(MATRIX)[:2], np.ones((len(points), 1))], axis=1)
-    project = cv2.fisheye.projectPoints if lens == "equidistant" else cv2.projectPoints
-    return project(rays[:, None], np.zeros(3), np.zeros(3), MATRIX, np.array(BENT[lens]))[0][:, 0]
-
-
 def tracks(lens: str = "") -> tuple[Tracks, np.ndarray]:
     rng = np.random.default_rng(0)
     names = ("pelvis", "rhip", "rknee", "rankle", "lhip", "lknee", "lankle", "neck", "head")
@@ -62,7 +55,7 @@ def tracks(lens: str = "") -> tuple[Tracks, np.ndarray]:
     sway = 3.0 * np.sin(np.arange(40) / 6.0)
     ideal = 2.0 * body + [300.0, 300.0] + sway[:, None, None]
     spots = rng.uniform([100, 100], [1200, 650], (40, 2))
-    seen, point = (bent(ideal.reshape(-1, 2), lens).reshape(ideal.shape), bent(spots, lens)) if lens else (ideal, spots)
+    seen, point = (bent(ideal, MATRIX, lens), bent(spots, MATRIX, lens)) if lens else (ideal, spots)
     seen = seen.copy()
     seen[0, 0] = np.nan
     background = Background(np.zeros(40, np.int32), np.arange(40), point.astype(np.float32))
@@ -141,3 +134,19 @@ def test_wrong_knowledge_is_refused(
     assert main(["reconstruct", str(tmp_path / "tracks.npz"), "--out", str(tmp_path / "out"), "--quiet", *options]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_what_no_ideal_lens_shows_is_left_out() -> None:
+    """A fisheye's side: OpenCV gives a million px."""
+    lens = CameraModel(*SIZE, MATRIX, np.array([-0.4, 0.0, 0.0, 0.0]), "equidistant")
+    point = np.array([[640.0, 360.0], [1e4, 360.0]], np.float32)
+    assert np.isfinite(lens.undistorted(point)).all(axis=1).tolist() == [True, False]
+    flat = lens.flat_points(Background(np.zeros(2, np.int32), np.arange(2), point))
+    assert flat is not None
+    assert flat.track.tolist() == [0]
+
+
+def test_the_number_of_coefficients_fits_the_model(tmp_path: Path) -> None:
+    (path := tmp_path / "lens.yaml").write_text(ros_yaml("plumb_bob").replace("plumb_bob", "equidistant"))
+    with pytest.raises(InputError, match="expected 4 finite distortion coefficients of equidistant"):
+        load_calibration(path)

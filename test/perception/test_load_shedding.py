@@ -9,7 +9,8 @@ from drocap_ros.keypoints import PoseObservation
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import SIMULATION, models_folder
-from drocap_ros.perception.load_shedding import KeypointFlow
+from drocap_ros.perception.load_shedding import Follower, KeypointFlow
+from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 pytest.importorskip("onnxruntime")
@@ -210,3 +211,43 @@ def test_a_box_that_moves_out_of_the_image_ends_at_its_border():
     assert np.nanmedian(after.keypoints[:, 0] - joints[:, 0]) == pytest.approx(-6.0, abs=0.5)
     assert after.roi[0] == 0.0
     assert after.roi[2] == pytest.approx(116.0, abs=0.5)
+
+
+@pytest.mark.parametrize("late", [2, 4, 8])
+def test_images_are_followed_while_the_networks_look_at_one_of_those_before(estimator, images, late):
+    """Each image has keypoints at once, with covariances that grow until the networks' come."""
+    clear = [estimator.process(image, i * STEP_NS) for i, image in enumerate(images[:60])]
+    follower, looked, seen = Follower(estimator.hand_over()), 0, []
+    for i, image in enumerate(images[:60]):
+        if i >= looked + late:  # the networks are done with that one, and look at the newest
+            follower.correct(clear[looked])
+            looked = i
+        seen.append(follower.follow(Frame(i * STEP_NS, image)))
+    assert seen[: late + 1] == [None] * late + [seen[late]]
+    assert seen[late:].count(None) <= 2  # where most joints moved too far
+    for now, true in zip(seen[late:], clear[late:60], strict=True):
+        if now is None:
+            continue
+        assert now.stamp_ns == true.stamp_ns
+        size = (true.roi[2:] - true.roi[:2]).max()
+        off = np.linalg.norm(now.keypoints - true.keypoints, axis=1) / size
+        assert np.nanmedian(off) < 0.04
+        assert np.nanmedian(now.covariance[:, 0]) > np.nanmedian(true.covariance[:, 0])
+
+
+def test_keypoints_of_another_stream_are_not_taken_for_those_of_an_image_that_was_followed(estimator, images):
+    follower = Follower(estimator.hand_over())
+    seen = estimator.process(images[0], 0)
+    assert follower.follow(Frame(STEP_NS, images[1])) is None
+    follower.correct(seen)
+    assert follower.follow(Frame(2 * STEP_NS, images[2])) is None
+
+
+def test_followed_keypoints_of_a_picture_that_stands_still_repeat_bit_for_bit(estimator, images):
+    follower, first = Follower(estimator.hand_over()), estimator.process(images[0], 0)
+    follower.follow(Frame(0, images[0]))
+    follower.correct(first)
+    for i in range(1, 9):
+        again = follower.follow(Frame(i * STEP_NS, images[0]))
+        assert again.stamp_ns == i * STEP_NS
+        assert np.array_equal(again.keypoints, first.keypoints, equal_nan=True)

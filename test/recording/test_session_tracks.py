@@ -363,7 +363,7 @@ def test_a_frame_of_a_camera_is_the_cameras(tmp_path, messages, capture, frame):
 @pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant"])
 @pytest.mark.parametrize("rectified", [False, True])
 def test_the_distortion_and_the_projection_of_a_camera_info_are_used(tmp_path, messages, capture, model, rectified):
-    from drocap_ros.perception.calibration import CameraModel
+    from drocap_ros.geometry.lens import CameraModel
     from drocap_ros.recording.session_tracks import with_recorded_camera
 
     tracks = dataclasses.replace(capture.tracks, camera_matrix=None)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import logging
 import math
+import os
 import statistics
 import sys
 import threading
@@ -23,9 +25,10 @@ from drocap_ros.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
+    from drocap_ros.clip import Progress
     from drocap_ros.config import DrocapConfig
     from drocap_ros.flight.preflight.findings import Finding, Measured
-    from drocap_ros.flight.preflight.setup_checks import Pictures, Setup
+    from drocap_ros.flight.preflight.setup_checks import Pace, Pictures, Setup
     from drocap_ros.perception.sources.base import ImageIngestConfig
 
 _COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red"}
@@ -33,6 +36,8 @@ _COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red
 _USUAL_SIZE = (1280, 720)
 #: Images that give the rate, two seconds at 15 Hz, and how long they may take.
 _IMAGES, _LOOK_S = 30, 5.0
+#: How long the networks are watched.
+_PACE_S = 10.0
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -74,6 +79,10 @@ def run(args: argparse.Namespace) -> int:
     measured = _measure(config, args)
     if not measured.bridge:  # a running graph has its camera open
         setup = setup._replace(pictures=look(config.image_ingest))
+        if setup.models and setup.pictures is not None and not setup.pictures.refusal:
+            with progress_bars(args.quiet) as progress:
+                pace = pace_of(config, Path(setup.models), setup.pictures.rate_hz, progress)
+            setup = setup._replace(pictures=setup.pictures._replace(pace=pace))
     found = all_findings(config.mavlink_bridge, setup, measured)
     ready = is_ready(found)
     status = 2 if not measured.heard else 0 if ready else 1
@@ -136,6 +145,50 @@ def look(ingest: ImageIngestConfig) -> Pictures | None:
     # Only a driver says when it exposed: stamps of a stream are times of arrival, of a file times since its start.
     latency_s = statistics.median(late_s) if ingest.source.startswith(DRIVER) else math.nan
     return Pictures("", source.size, rate_hz, latency_s, blank)
+
+
+def pace_of(config: DrocapConfig, models: Path, rate_hz: float, progress: Progress) -> Pace | None:
+    """Run the networks on the images of the source as the graph does; None where it has too few, or no rate."""
+    from drocap_ros.flight.preflight.setup_checks import Pace
+    from drocap_ros.perception.estimator import PoseEstimator
+    from drocap_ros.perception.sources import open_source
+    from drocap_ros.perception.sources.base import prefetch
+    from drocap_ros.ros.own_process import LoadShedding
+
+    logging.getLogger("drocap_ros.perception.estimator.networks").setLevel(logging.ERROR)  # the graph says it
+    chosen = config.pose_estimator
+    estimator, shedding = PoseEstimator(models, chosen), LoadShedding(chosen.max_load_level)
+    begin_s = first_ns = took_s = shown_s = 0.0
+    taken = looked = pixels = 0
+    with open_source(config.image_ingest.source, config.image_ingest) as source:
+        ends = threading.Timer(_PACE_S + _LOOK_S, source.close) if source.live else None
+        if ends:
+            ends.start()
+        for frame in source if source.live else prefetch(source):
+            level, pixels = 0, frame.image.shape[0] * frame.image.shape[1]
+            if begin_s:
+                shown_s, now_s = 1e-9 * (frame.stamp_ns - first_ns), time.perf_counter() - begin_s
+                progress("networks", min(now_s / _PACE_S, 1.0))
+                if max(shown_s, now_s) > _PACE_S:
+                    break
+                if now_s - shown_s > 2.0 / rate_hz:  # a file waits; a camera does not
+                    continue
+                time.sleep(max(0.0, shown_s - now_s))
+                level = shedding.level(now_s, took_s > 1.0 / rate_hz, 0)
+            work_s = time.perf_counter()
+            estimator.process(frame.image, frame.stamp_ns, load_level=level)
+            took_s = time.perf_counter() - work_s
+            if begin_s:
+                taken, looked = taken + 1, looked + (not estimator.propagated)
+            else:  # the first one warms the networks up
+                begin_s, first_ns = time.perf_counter(), frame.stamp_ns
+        if ends:
+            ends.cancel()
+    seconds = min(time.perf_counter() - begin_s, _PACE_S)
+    if not (looked and seconds * rate_hz >= _IMAGES):
+        return None
+    passed_over = max(0.0, 1.0 - taken / (seconds * rate_hz))
+    return Pace(seconds, passed_over, taken / looked, pixels, chosen.threads, os.cpu_count() or 1)
 
 
 def _camera(ingest: ImageIngestConfig) -> tuple[np.ndarray | None, tuple[int, int], str]:

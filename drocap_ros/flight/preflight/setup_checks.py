@@ -27,6 +27,27 @@ _GOOD_PX = 150.0  # height of a person from which they do not gain
 _WALK_M_S = 1.4  # of a brisk walk
 _MEASURED_SIZE_ERROR = 0.05  # share: a stature that nobody measured errs by more
 _LEAST_ROOM_M = 10.0  # for the subject's walk
+_PASSED_OVER = 0.03  # share of the images that a pause of the machine may cost
+_TOO_MANY = 0.5  # share without which the bridge sees too little
+_SELDOM = 3.0  # images for one that the networks look at, above which optical flow errs by more than they do,
+_OFTEN = 2.0  # and what a remedy aims at
+_ENOUGH_PX = 1280 * 720  # of an image: networks see it smaller
+
+
+class Pace(NamedTuple):
+    """How the networks keep up with the source, alone on this machine.
+
+    seconds, passed_over : measured, and share of the images that were passed over meanwhile
+    every : images for one that the networks looked at; optical flow followed the others
+    pixels, threads, cores : of an image, of a network as configured, of this machine
+    """
+
+    seconds: float
+    passed_over: float
+    every: float
+    pixels: int
+    threads: int
+    cores: int
 
 
 class Pictures(NamedTuple):
@@ -37,6 +58,7 @@ class Pictures(NamedTuple):
     rate_hz : NaN = it gave one image
     latency_s : from the driver's stamp of the exposure until the image was here; NaN = it does not say
     blank : whether all images are of one colour
+    pace : None = not measured
     """
 
     refusal: str = ""
@@ -44,6 +66,7 @@ class Pictures(NamedTuple):
     rate_hz: float = math.nan
     latency_s: float = math.nan
     blank: bool = False
+    pace: Pace | None = None
 
 
 class Setup(NamedTuple):
@@ -88,6 +111,8 @@ def setup_findings(config: MavlinkBridgeConfig, setup: Setup, vehicle: VehicleSt
     yield _source(setup)
     if setup.pictures is not None:
         yield _opened(setup, setup.pictures)
+        if setup.pictures.pace is not None:
+            yield _pace(setup.pictures.pace, setup.pictures.rate_hz)
     yield _camera(setup)
     if setup.camera_matrix is not None:
         yield _picture(config, setup, setup.camera_matrix, vehicle)
@@ -159,6 +184,25 @@ def _opened(setup: Setup, pictures: Pictures) -> Finding:
         "latency_s": pictures.latency_s,
     }  # fmt: skip
     return Finding(graded(warning=bool(remedies)), ", ".join(words), wanted, "; ".join(remedies), values)
+
+
+@check("pace", "this machine", _C.PICTURES_LATE)
+def _pace(pace: Pace, rate_hz: float) -> Finding:
+    """Whether networks and images keep pace, without the other nodes."""
+    keeps_up = pace.passed_over < _PASSED_OVER
+    words = "keeps up with" if keeps_up else f"passes over {pace.passed_over:.0%} of"
+    found = f"{words} {rate_hz:.3g} images/s for {pace.seconds:.0f} s, the networks look at one in {pace.every:.1f}"
+    rate_hz *= (1.0 - pace.passed_over) * min(1.0, _OFTEN / pace.every)
+    remedies = [f"set image_ingest.max_rate_hz to {max(1, round(rate_hz))}"]
+    if pace.pixels > _ENOUGH_PX:
+        remedies.append("width_px and height_px to 1280 and 720")
+    if pace.cores > 2 * pace.threads:
+        remedies.append(f"pose_estimator.threads to {pace.cores // 2}")
+    else:
+        remedies.append("pose_model or detector to a smaller one (drocap models list)")
+    level = graded(missing=pace.passed_over > _TOO_MANY, warning=not keeps_up or pace.every > _SELDOM)
+    values = {"passed_over": pace.passed_over, "every": pace.every, "seconds": pace.seconds}
+    return Finding(level, found, f"one in {_SELDOM:g} or more, none passed over", ", or ".join(remedies), values)
 
 
 @check("camera", "camera", _C.NO_CAMERA_INFO)

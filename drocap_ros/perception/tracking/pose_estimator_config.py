@@ -63,8 +63,8 @@ class PoseEstimatorConfig(Parameters):
     )
     max_load_level: int = param(
         3,
-        "highest level of load shedding: images in sequence whose keypoints are propagated by optical flow; 0 = full"
-        " work always, images are dropped instead",
+        "highest level of load shedding: images in sequence whose keypoints are propagated by optical flow; from 3 on"
+        " none waits for slow networks; 0 = full work always, images are dropped instead",
         minimum=0,
         maximum=10,
     )

@@ -35,7 +35,7 @@ _WORDS = {
 
 
 class Step(NamedTuple):
-    """An image whose keypoints and initial pose are both known.
+    """An image whose keypoints, without the distortion of its lens, and initial pose are both known.
 
     event : its relation to the images before; None where the stamp of the initial pose was refused
     latest : with what the last window says of the person and the camera; None where the image is dropped, or a newer
@@ -78,7 +78,7 @@ class LiveCore:
         """Take an image's keypoints; topics keep no order between them, so either part may come first."""
         if not observation.has_subject:
             return None
-        self._observations[observation.stamp_ns] = observation
+        self._observations[observation.stamp_ns] = self.cameras.flat(observation)
         return self._joined(observation.stamp_ns)
 
     def add_initial(self, pose: LivePose) -> Step | None:
@@ -95,7 +95,7 @@ class LiveCore:
         window = self._buffer.window()
         return window._replace(
             camera=self.cameras.along(window.stamp_ns, window.image_size),
-            background=self.points.along(window.stamp_ns),
+            background=self.cameras.flat_points(window.stamp_ns, window.image_size, self.points.along(window.stamp_ns)),
             known_ns=(self.cameras.newest_ns, self.points.newest_ns),
         )
 
@@ -175,7 +175,7 @@ def live_results(
     """
     arrivals = StampValidator()  # of pose3d/initial at the adjuster's node
     for observation in observations:
-        pose = _initial_pose(initializer, observation)
+        pose = _initial_pose(initializer, core.cameras.flat(observation))
         if pose is None:
             continue
         try:

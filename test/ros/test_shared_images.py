@@ -1,0 +1,74 @@
+"""Decoded images in shared memory: whole ones of their stamps, or none."""
+
+from __future__ import annotations
+
+import os
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drocap_ros.ros import shared_images
+from drocap_ros.ros.shared_images import SharedImages
+
+
+@pytest.fixture
+def ring(tmp_path, monkeypatch):
+    """A writer and a reader of one graph."""
+    monkeypatch.setattr(shared_images, "_FOLDER", tmp_path)
+    node = SimpleNamespace(context=SimpleNamespace(get_domain_id=lambda: 7), get_namespace=lambda: "/a/b")
+    pair = SharedImages(node), SharedImages(node)
+    yield pair
+    for end in pair:
+        end.close()
+    assert not list(tmp_path.iterdir())
+
+
+def image_of(number, size=(36, 64)):
+    return np.full((*size, 3), number % 251, np.uint8)
+
+
+def test_the_newest_images_are_found_by_their_stamps(ring):
+    writer, reader = ring
+    assert reader.get(1) is None
+    for number in range(1, 20):
+        writer.put(number, image_of(number))
+        assert np.array_equal(reader.get(number), image_of(number))
+    assert [reader.get(number) is None for number in (11, 12, 20)] == [True, False, True]
+    # Another size, and another writer after the death of the first one.
+    writer.put(30, image_of(30, (20, 10)))
+    assert np.array_equal(reader.get(30), image_of(30, (20, 10)))
+    writer.close()
+    assert reader.get(30) is None
+
+
+def test_no_image_is_a_mixture_of_two(ring):
+    writer, reader = ring
+    ended = threading.Event()
+
+    def write():
+        for number in range(1, 3000):
+            writer.put(number, image_of(number, (90, 160)))
+        ended.set()
+
+    thread, found, last = threading.Thread(target=write), 0, 0
+    thread.start()
+    while not ended.is_set():
+        for number in range(last + 1, last + 12):
+            if (image := reader.get(number)) is not None:
+                assert (image == number % 251).all()
+                found, last = found + 1, number
+                break
+        else:
+            last = int(reader._head()[2]) if reader._memory is not None else 0
+    thread.join()
+    assert found > 3
+
+
+def test_where_there_is_no_room_or_another_ones_file_there_are_no_images(ring, monkeypatch):
+    writer, reader = ring
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1, f_frsize=4096))
+    writer.put(1, image_of(1))
+    assert reader.get(1) is None
+    monkeypatch.undo()
