@@ -35,9 +35,9 @@ BUDGETS = {
     ("recording",): 6.55,  # keypoints of any order (0.45), tables, GPX, GPMF, several in a log; damaged recordings
     ("simulation",): 3.45,  # reports err as recorded ones
     ("evaluation",): 1.08,  # truth from C3D, TRC and BVH by the names of other programs (0.34), one of several bodies
-    ("export", "report", "view"): 4.46,  # OpenSim, USD and FBX (0.17), a report of several persons, the video beside it
-    ("ros", "nodes", "bringup"): 4.52,  # lockstep and processes of their own
-    ("cli",): 4.77,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06, and 0.11 of perception)
+    ("export", "report", "view"): 4.76,  # OpenSim, USD and FBX (0.17), an avatar's bones live (0.29), several persons
+    ("ros", "nodes", "bringup"): 4.72,  # poses to other programs (0.20); lockstep and processes of their own
+    ("cli",): 4.80,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06), receivers of poses (0.03)
     ("lab", "benchmarks"): 11.75,  # flights that are drawn (0.35), mutants of the product (0.17), heights (0.08)
 }  # fmt: skip
 #: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.
