@@ -21,13 +21,13 @@ def chromium() -> str | None:
 class Browser:
     """One page; messages are NUL-terminated JSON on file descriptors 3 and 4."""
 
-    def __init__(self, profile: Path) -> None:
+    def __init__(self, profile: Path, *options: str) -> None:
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
         arguments = [
             chromium(), "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run",
             "--disable-dev-shm-usage", "--disable-background-networking", "--remote-debugging-pipe",
-            f"--user-data-dir={profile}", "about:blank",
+            f"--user-data-dir={profile}", *options, "about:blank",
         ]  # fmt: skip
         # The program reads on 3 and writes on 4; a shell puts our ends there, whatever their numbers are here.
         script = f'exec 3<&{to_read} 4>&{to_write}; exec "$@"'
@@ -76,8 +76,8 @@ class Browser:
         self._last = method
         return message
 
-    def open(self, path: Path, width: int, height: int, *, dark: bool = False) -> None:
-        """Load a file in a window of a size and wait until it is drawn."""
+    def open(self, path: Path | str, width: int, height: int, *, dark: bool = False) -> None:
+        """Load a file or an address in a window of a size and wait until it is drawn."""
         self.errors.clear()
         self.requests.clear()
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
@@ -85,7 +85,7 @@ class Browser:
         self.send(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
-        self.send("Page.navigate", url=path.as_uri())
+        self.send("Page.navigate", url=path.as_uri() if isinstance(path, Path) else path)
         while self._last != "Page.loadEventFired":
             self._receive()
         self.settle()
