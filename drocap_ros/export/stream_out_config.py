@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from dataclasses import dataclass
 
 from drocap_ros.errors import ParameterError
@@ -43,4 +44,7 @@ def address_of(text: str, name: str) -> tuple[str, int]:
 
 def is_loopback(host: str) -> bool:
     """Whether an address is this machine's own alone."""
-    return host in ("localhost", "::1") or host.startswith("127.")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:  # another name, whatever it begins with
+        return False

@@ -13,7 +13,9 @@ import math
 import socket
 import threading
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
+import numpy as np
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
 
 #: A pose this old shows nobody.
 _OLD_S = 0.5
+#: A path's windows, each with its camera, come every second or two; after this time there is none any more.
+_UP_S = 5.0
 #: Share of a period after which the newest pose is sent again: a timer may be early.
 _DUE = 0.9
 #: To wait for an event loop, s.
@@ -55,8 +59,8 @@ class StreamOutNode(ComponentNode):
             else:  # the other stage is matched, as the graph expects
                 self.input(topic, self._on_tf if topic == "/tf" else lambda _: None, raw=True)
         self._person, self._rig = (0, ""), LiveRig(())
-        self._up = up_of_pitch(math.radians(self.config.camera_pitch_deg))
-        self._leveled = f"camera_pitch_deg {self.config.camera_pitch_deg:g}"
+        self._pitched = up_of_pitch(math.radians(self.config.camera_pitch_deg))
+        self._up, self._up_s = self._pitched, -math.inf
         self._pose: AvatarPose | None = None
         self._stamp_ns, self._frame = 0, ""
         self._begin_s, self._came_s, self._sent_s = self.now_s(), -math.inf, -math.inf
@@ -85,7 +89,13 @@ class StreamOutNode(ComponentNode):
             if transform.header.frame_id == ODOM:
                 q = transform.transform.rotation
                 self._up = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv().apply([0.0, 0.0, 1.0])
-                self._leveled = f"the camera in {ODOM}"
+                self._up_s = self.now_s()
+
+    def _leveled_by(self) -> tuple[np.ndarray, str]:
+        """Up in the camera's frame, and by what it is known."""
+        if self.now_s() - self._up_s < _UP_S:
+            return self._up, f"the camera in {ODOM}"
+        return self._pitched, f"camera_pitch_deg {self.config.camera_pitch_deg:g}"
 
     def _on_pose(self, message: Pose3D) -> None:
         pose = pose3d_from_ros(message)
@@ -95,10 +105,11 @@ class StreamOutNode(ComponentNode):
         self._pose = None
         if message.track_id:
             in_world = frame in (MAP, ODOM)
-            upright = y_up_of(pose.joints3d, None if in_world else self._up)
+            up, known_by = (None, "") if in_world else self._leveled_by()
+            upright = y_up_of(pose.joints3d, up)
             self._pose = self._rig.pose(upright, pose.confidence, pose.stamp_ns, on_floor=not in_world)
-            level = f"{frame}, leveled by {self._leveled}; on the floor, without a place"
-            self.details[Key.FRAME] = frame if in_world else level
+            level = "" if in_world else f", leveled by {known_by}; on the floor, without a place"
+            self.details[Key.FRAME] = frame + level
         self._stamp_ns, self._frame, self._came_s = pose.stamp_ns, frame, self.now_s()
         self._send()
         self.count(Key.POSES)
@@ -138,6 +149,7 @@ class WebClients:
 
     def __init__(self, host: str, port: int) -> None:
         self._text, self._changed = "", asyncio.Event()
+        self._private = is_loopback(host)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="websocket", daemon=True)
         self._thread.start()
@@ -162,6 +174,9 @@ class WebClients:
     async def _talk(self, request: web.Request) -> web.WebSocketResponse:
         from aiohttp import web
 
+        origin = urlsplit(request.headers.get("Origin", "")).hostname
+        if self._private and origin and not is_loopback(origin):  # a foreign page in a browser of this computer
+            raise web.HTTPForbidden
         client = web.WebSocketResponse(heartbeat=10.0)
         await client.prepare(request)
         listening = asyncio.ensure_future(client.receive())  # ends with the client; what it says is not asked for

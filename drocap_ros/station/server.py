@@ -12,6 +12,7 @@ from urllib.parse import parse_qs
 
 from drocap_ros.errors import InputError
 from drocap_ros.export.stream_out_config import is_loopback
+from drocap_ros.station.page import Page
 from drocap_ros.station.station import Station
 
 if TYPE_CHECKING:
@@ -81,8 +82,6 @@ def serve(station: Station, sock: socket.socket, token: str, stop: threading.Eve
     from nicegui import ui
     from starlette.responses import Response
 
-    from drocap_ros.station.page import build_page
-
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     app.add_middleware(Door, token=token, port=sock.getsockname()[1])
 
@@ -114,7 +113,7 @@ def serve(station: Station, sock: socket.socket, token: str, stop: threading.Eve
 
     @ui.page("/", title="drocap station")
     def page() -> None:
-        build_page(station)
+        Page(station)
 
     logging.getLogger("nicegui").setLevel(logging.ERROR)  # warnings of its own end are no user's business
     ui.run_with(

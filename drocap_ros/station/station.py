@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -108,10 +109,16 @@ class Station:
         try:
             while not self._stop.is_set():
                 self._graph.spin_for(_CHECK_S, self._stop)
-                if self._desk.statuses:
-                    self.findings = self.views.findings()
+                self._check()
         except BaseException as error:  # noqa: BLE001 -- shown where the station ends
             self.failure = error
+
+    def _check(self) -> None:
+        try:
+            self.findings = self.views.findings() if self._desk.statuses else ()
+        except Exception:
+            # A table must not end the operator's console.
+            logging.getLogger(__name__).exception("preflight")
 
     def close(self) -> None:
         """End the thread."""
@@ -248,11 +255,7 @@ class Station:
 
 def _state_of(status: Message | None, silent_s: float) -> tuple[str, str, str]:
     if status is None:
-        return (
-            "silent",
-            "negative",
-            "no word from mavlink_bridge yet: is the graph running in this domain and namespace?",
-        )
+        return "silent", "negative", "no word from mavlink_bridge yet; does a graph run in this domain and namespace?"
     name = next((code.name for code in ConditionCode if code == status.condition), "")
     words = f"{sentence(status)} [{name} {status.condition}]"
     if silent_s > OLD_S:

@@ -195,7 +195,8 @@ async def inside(scope, receive, send):
 def test_on_the_loopback_another_hosts_name_is_refused():
     door = Door(inside, "", 8090)
     assert ask(door)[0] == 200
-    assert ask(door, host="localhost:8090")[0] == 200
+    assert ask(door, host="localhost:8090")[0] == ask(door, host="[::1]:8090")[0] == 200
+    assert ask(door, host="127.evil.example:8090")[0] == 403
     for kind in ("http", "websocket"):
         assert ask(door, host="evil.example:8090", kind=kind)[0] == 403
 

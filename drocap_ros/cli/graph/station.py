@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import secrets
+import socket
 import sys
 import webbrowser
 
@@ -58,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.flight.preflight.measure import all_findings
     from drocap_ros.station.server import listen, serve
     from drocap_ros.station.station import Station, Views
+    from drocap_ros.view.motion_view import has_screen
 
     setup, bridge = setup_of(config, args.models), config.mavlink_bridge
     token = "" if is_loopback(args.host) else secrets.token_urlsafe(16)
@@ -75,14 +77,15 @@ def run(args: argparse.Namespace) -> int:
         )
         station = Station(graph, bridge, views)
         try:
-            host = f"[{args.host}]" if ":" in args.host else args.host
+            any_address = args.host in ("0.0.0.0", "::")
+            host = socket.gethostname() if any_address else f"[{args.host}]" if ":" in args.host else args.host
             address = f"http://{host}:{args.port}/" + (f"?token={token}" if token else "")
             print(f"open {address} in a browser; Ctrl-C stops", flush=True)
             if token:
                 print(
                     "drocap: warning: the page is not encrypted; whoever reads the network may command", file=sys.stderr
                 )
-            if not args.no_browser:
+            if has_screen() and not args.no_browser:
                 webbrowser.open(address)
             serve(station, sock, token, stop)
         finally:
