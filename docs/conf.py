@@ -68,7 +68,7 @@ html_title = f"drocap_ros {release}"
 #: Places of the pages in the site's menu; those of `figures/` stand below their own index.
 MENU = {
     "Use": "tutorial install models telemetry report export batch",
-    "Fly": "live first_flight flight sessions",
+    "Fly": "live station live_out first_flight flight sessions",
     "Look up": "parameters api quality_declaration figures/README",
     "Understand": "reconstruction accuracy",
 }

@@ -24,9 +24,10 @@ from drocap_ros.perception.load_models import models_folder  # noqa: E402
 from drocap_ros.perception.track_video import tracks_from_observations  # noqa: E402
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig  # noqa: E402
 from drocap_ros.reconstruction.reconstruct import reconstruct  # noqa: E402
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix  # noqa: E402
+from drocap_ros.simulation.pinhole import pinhole_matrix  # noqa: E402
 from drocap_ros.simulation.render.renderer import Renderer  # noqa: E402
 from drocap_ros.simulation.simulated_person import simulate_person  # noqa: E402
+from lab.simulation.orbit import orbit_camera  # noqa: E402
 
 SEED, SECONDS, FPS, ACTION = 11, 8.0, 15.0, "walk"
 WIDTH, HEIGHT, FIELD_DEG = 1280, 720, 60.0

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import get_type_hints
 
 from drocap_ros.errors import InputError, ParameterError
+from drocap_ros.export.stream_out_config import StreamOutConfig
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.parameters import Parameters, Values
 from drocap_ros.perception.sources.base import ImageIngestConfig
@@ -39,6 +40,7 @@ class DrocapConfig:
     session_recorder: SessionRecorderConfig = field(default_factory=SessionRecorderConfig)
     session_player: SessionPlayerConfig = field(default_factory=SessionPlayerConfig)
     visualizer: VisualizerConfig = field(default_factory=VisualizerConfig)
+    stream_out: StreamOutConfig = field(default_factory=StreamOutConfig)
     flight_simulator: FlightSimulatorConfig = field(default_factory=FlightSimulatorConfig)
 
     def section(self, component: str) -> Parameters:

@@ -20,7 +20,7 @@ pytest_plugins = ["fixtures_export", "fixtures_recording", "fixtures_reconstruct
 
 #: Where nodes run, ports are listened to or time is measured, and what of it only computes.
 CLOCKED = (
-    "nodes", "ros", "system", "view", "cli/test_live_cli.py", "cli/test_preflight_command.py",
+    "nodes", "ros", "station", "system", "view", "cli/test_live_cli.py", "cli/test_preflight_command.py",
     "app/test_app_in_browser.py",
     "lab/commands/test_train_lifter.py", "flight/mavlink/test_link.py", "flight/mavlink/test_signing.py",
     "flight/mavlink/test_gimbal.py", "perception/sources/test_live_sources.py",
@@ -32,7 +32,7 @@ COMPUTING = ("system/test_packaging.py", "system/test_simulated_demo.py")
 #: Those of them that count messages or frames while the graph is busy: many tests beside them disturb them.
 COUNTING = (
     "nodes/test_bundle_adjuster.py", "nodes/test_live_replay.py", "ros/test_slow_stages.py", "system/test_bringup.py",
-    "system/test_live_faults.py", "system/test_orbit", "view",
+    "station/test_page_in_browser.py", "system/test_live_faults.py", "system/test_orbit", "view",
 )  # fmt: skip
 #: Files that take longest begin, so that none of them ends alone.
 LONG = (

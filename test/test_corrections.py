@@ -23,10 +23,11 @@ from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import aligned_error
 from drocap_ros.motion import load_motion
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.simulation.orbit_camera import orbit_camera, project
+from drocap_ros.simulation.pinhole import project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks, save_tracks
+from lab.simulation.orbit import orbit_camera
 
 FPS, FRAMES, SIZE, FOCAL = 24.0, 150, (1280, 720), 1100.0
 BEGIN, END = 60, 84  # images in which the network errs

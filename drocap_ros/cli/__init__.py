@@ -19,8 +19,8 @@ from drocap_ros.errors import DrocapError, InputError
 
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
 COMMANDS = (
-    "demo.command", "graph.live", "graph.preflight", "view", "graph.orbit", "graph.record", "graph.replay",
-    "app", "sample", "track", "reconstruct", "batch", "export", "report", "info", "recover",
+    "demo.command", "graph.live", "graph.preflight", "graph.station", "view", "graph.orbit", "graph.record",
+    "graph.replay", "app", "sample", "track", "reconstruct", "batch", "export", "report", "info", "recover",
     "graph.top", "models", "calibrate", "evaluate",
 )  # fmt: skip
 

@@ -6,6 +6,7 @@ positions do not show the twist of forearms, thighs and other bones about their 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ from drocap_ros.skeleton import BODY_15, TOES
 
 #: Fading time of the twist that keeps a rotation continuous where a bone points against its rest direction.
 TWIST_FADE_S = 0.5
+#: Cosine between a bone and its rest direction below which the smallest rotation turns too fast.
+AGAINST = -0.7
 #: Rest poses: angle of the arms below the horizontal, degrees.
 RESTS = {"t": 0.0, "a": 45.0}
 
@@ -139,8 +142,8 @@ def onto_the_floor(body: RigidBody, pelvis: np.ndarray) -> tuple[np.ndarray, str
 
 
 def _rig(body: RigidBody, rate_hz: float, lift: np.ndarray, naming: dict[str, str], rest: str) -> Rig:
-    offsets = _rest_offsets(body, RESTS[rest])
-    turned = _rotations(body, offsets, rate_hz)
+    offsets = rest_offsets(body, RESTS[rest])
+    turned = bone_rotations(body, offsets, lambda _, at_rest, now: least_rotation(at_rest, now, rate_hz))
     kept = _kept_joints(body, naming)
     parents = (-1, *(kept.index(PARENTS[joint]) for joint in kept[1:]))
     tips = _tips(offsets)
@@ -182,7 +185,7 @@ def _tips(offsets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return tips
 
 
-def _rest_offsets(body: RigidBody, arms_down_deg: float) -> dict[str, np.ndarray]:
+def rest_offsets(body: RigidBody, arms_down_deg: float) -> dict[str, np.ndarray]:
     """Offset of each joint of ``BODY`` from its parent in the rest pose."""
     cosine, sine = np.cos(np.radians(arms_down_deg)), np.sin(np.radians(arms_down_deg))
     toe = np.array([0.0, -SOLE, _FOOT]) * 0.5 * (body.lengths["lankle"] + body.lengths["rankle"])
@@ -198,8 +201,14 @@ def _rest_offsets(body: RigidBody, arms_down_deg: float) -> dict[str, np.ndarray
     return out
 
 
-def _rotations(body: RigidBody, offsets: dict[str, np.ndarray], rate_hz: float) -> dict[str, Rotation]:
-    """Joint of ``BODY`` -> rotations (F,) of its bones from the rest pose to the world."""
+def bone_rotations(
+    body: RigidBody, offsets: dict[str, np.ndarray], swing: Callable[[str, np.ndarray, np.ndarray], Rotation]
+) -> dict[str, Rotation]:
+    """Joint of ``BODY`` -> rotations (F,) of its bones from the rest pose to the world.
+
+    offsets : of :func:`rest_offsets`
+    swing : rotations (F,) of the bone that ends at a joint from its rest direction (3,) to its directions (F, 3)
+    """
     bend = log_so3(np.swapaxes(body.pelvis, 1, 2) @ body.chest)
     out = {
         joint: Rotation.from_matrix(body.pelvis @ exp_so3(share * bend))
@@ -214,7 +223,7 @@ def _rotations(body: RigidBody, offsets: dict[str, np.ndarray], rate_hz: float) 
         if child is not None:
             rest = offsets[child] / np.linalg.norm(offsets[child])
             direction = directions(body.at(child) - body.at(joint))
-            out[joint] = above * least_rotation(rest, above.inv().apply(direction), rate_hz)
+            out[joint] = above * swing(child, rest, above.inv().apply(direction))
     return out
 
 
@@ -224,26 +233,34 @@ def least_rotation(rest: np.ndarray, direction: np.ndarray, rate_hz: float) -> R
     Where a bone points against its rest direction, the smallest rotation is ambiguous and jumps; there the rotation
     continues from the previous frame, and the added twist fades out.
     """
-    swing = _shortest_arc(np.broadcast_to(rest, direction.shape), direction)
+    swing = shortest_arc(np.broadcast_to(rest, direction.shape), direction)
     if len(direction) < 2:
         return swing
-    carried = _shortest_arc(direction[:-1], direction[1:]) * swing[:-1]
-    quaternion = (swing[1:].inv() * carried).as_quat()
-    jump = 2.0 * np.arctan2(quaternion[:, :3] @ rest, quaternion[:, 3])
-    jump = (jump + np.pi) % (2.0 * np.pi) - np.pi
-    # Cosine between a bone and its rest direction below which the smallest rotation turns too fast.
-    against = np.minimum(direction[1:] @ rest, direction[:-1] @ rest) < -0.7
-    jump = np.where(against, jump, 0.0)
     keep = float(np.exp(-1.0 / (rate_hz * TWIST_FADE_S)))
-    twist = lfilter([keep], [1.0, -keep], np.concatenate([[0.0], jump]))
+    twist = lfilter([keep], [1.0, -keep], np.concatenate([[0.0], jumps(rest, direction, swing)]))
     return swing * Rotation.from_rotvec(twist[:, None] * rest)
 
 
-def _shortest_arc(a: np.ndarray, b: np.ndarray) -> Rotation:
+def jumps(rest: np.ndarray, direction: np.ndarray, swing: Rotation) -> np.ndarray:
+    """(F - 1,) turns, rad, about ``rest`` that make each smallest rotation ``swing`` continue the one before.
+
+    They are 0 where neither points against the rest direction.
+    """
+    carried = shortest_arc(direction[:-1], direction[1:]) * swing[:-1]
+    quaternion = (swing[1:].inv() * carried).as_quat()
+    jump = 2.0 * np.arctan2(quaternion[:, :3] @ rest, quaternion[:, 3])
+    jump = (jump + np.pi) % (2.0 * np.pi) - np.pi
+    against = np.minimum(direction[1:] @ rest, direction[:-1] @ rest) < AGAINST
+    return np.where(against, jump, 0.0)
+
+
+def shortest_arc(a: np.ndarray, b: np.ndarray) -> Rotation:
+    """Smallest rotations (F,) from unit vectors ``a`` (F, 3) to ``b`` (F, 3)."""
     axis, cosine = np.cross(a, b), np.sum(a * b, axis=1)
-    # Opposite directions: half a turn about any perpendicular axis.
-    across = np.cross(a, np.where(np.abs(a[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     opposite = cosine < -1.0 + 1e-12
-    quaternion = np.concatenate([np.where(opposite[:, None], across, axis), 1.0 + cosine[:, None]], axis=1)
+    if opposite.any():  # half a turn about any perpendicular axis
+        across = np.cross(a, np.where(np.abs(a[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+        axis = np.where(opposite[:, None], across, axis)
+    quaternion = np.concatenate([axis, 1.0 + cosine[:, None]], axis=1)
     quaternion[opposite, 3] = 0.0
     return Rotation.from_quat(quaternion)

@@ -51,7 +51,8 @@ class Key:
     LATEST_POSES = "latest_poses"
     ADJUSTMENTS, ADJUSTMENTS_FAILED, ADJUSTMENTS_SKIPPED = "adjustments", "adjustments_failed", "adjustments_skipped"
     ADJUSTMENTS_CUT, ADJUSTMENTS_STRIDED = "adjustments_cut", "adjustments_strided"
-    FRAME = "frame"  # of pose3d/latest
+    FRAME = "frame"  # of pose3d/latest, or of what is sent to other programs and how it is leveled
+    PACKETS, PACKETS_REFUSED = "packets", "packets_refused"  # of VMC
     TELEMETRY = "telemetry"  # use of the camera's reported poses in the last adjustment
     TELEMETRY_REFUSED = "telemetry_refused"  # why, in words
     PICTURE_PATH = "picture_path"  # the camera's path in `odom`, or why there is none, in words

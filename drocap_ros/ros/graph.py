@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
 from collections import Counter, deque
@@ -11,10 +12,13 @@ from typing import Protocol
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from rclpy.task import Future
 
 from drocap_ros.errors import InputError, NodeError
+from drocap_ros.recording.session import Message
 from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.diagnostics import HARDWARE_ID, OK, WARN, Key, node_of, of, values_of
 from drocap_ros.ros.lifecycle import ACTIVE, FINALIZED
@@ -26,6 +30,53 @@ FIRST_PAUSE_S = 0.2
 LONGEST_PAUSE_S = 10.0
 #: A node that dies more often than this within a minute ends the graph.
 MOST_RESTARTS = 5
+
+
+class Newest:
+    """The last messages of a topic as they came; one that nobody asks for costs next to nothing.
+
+    kept : (time of arrival, s, monotonic; bytes), the newest last
+    """
+
+    def __init__(self, node: Node, topic: str, keep: int = 1) -> None:
+        self._message = TOPICS[topic].message
+        self.kept: deque[tuple[float, bytes]] = deque(maxlen=keep)
+
+        def take(data: bytes) -> None:
+            self.kept.append((time.monotonic(), data))
+
+        node.create_subscription(self._message, topic, take, TOPICS[topic].qos, raw=True)
+
+    def age_s(self) -> float:
+        """Time since the last message; infinite before the first."""
+        return time.monotonic() - self.kept[-1][0] if self.kept else float("inf")
+
+    def message(self) -> Message | None:
+        """The last message; None before the first."""
+        return self.read(self.kept[-1][1]) if self.kept else None
+
+    def read(self, data: bytes) -> Message:
+        """A message of the bytes of a kept one."""
+        return deserialize_message(data, self._message)
+
+    def stamped(self) -> dict[int, bytes]:
+        """Stamp, ns -> bytes of the kept messages, whose first field is a header."""
+        kept = [data for _, data in list(self.kept)]
+        return {sec * 10**9 + ns: data for data in kept for sec, ns in [struct.unpack_from("<iI", data, 4)]}
+
+
+class Managed:
+    """A managed node of a running graph, in whichever process."""
+
+    def __init__(self, node: Node, name: str) -> None:
+        self._client = node.create_client(ChangeState, f"{name}/change_state")
+
+    def set_active(self, active: bool) -> Future | None:
+        """Ask it to work or to pause; the future of its answer, None = it is not there."""
+        if not self._client.service_is_ready():
+            return None
+        number = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
+        return self._client.call_async(ChangeState.Request(transition=Transition(id=number)))
 
 
 class Runner(Protocol):
@@ -54,7 +105,9 @@ class Graph:
     respawn : whether a node that dies is restarted
     """
 
-    def __init__(self, node: Node, domain_id: int, namespace: str, names: list[str]) -> None:
+    def __init__(
+        self, node: Node, domain_id: int, namespace: str, names: list[str], executor: Executor | None = None
+    ) -> None:
         self.node = node
         self.domain_id = domain_id
         self.namespace = namespace
@@ -72,7 +125,7 @@ class Graph:
         self._published_s = float("-inf")
         self._due_s: dict[str, float] = {}
         self._died_s: dict[str, deque[float]] = {}
-        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor = executor or SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         entry = TOPICS["/diagnostics"]
         self._diagnostics = node.create_publisher(entry.message, "/diagnostics", entry.qos)

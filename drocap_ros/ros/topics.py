@@ -113,6 +113,8 @@ NODES: dict[str, NodeEntry] = {
         live=True,
         niceness=15,
     ),
+    # `drocap live` starts it where it has somewhere to send to.
+    "stream_out": NodeEntry((), ("pose3d/initial", "pose3d/latest", *_TF), niceness=3),  # as what makes the newest pose
     # The topics that it publishes are those of the session.
     "session_player": NodeEntry(source=True),
     "session_recorder": NodeEntry((), tuple(TOPICS), live=True, niceness=10),

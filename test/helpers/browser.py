@@ -21,13 +21,13 @@ def chromium() -> str | None:
 class Browser:
     """One page; messages are NUL-terminated JSON on file descriptors 3 and 4."""
 
-    def __init__(self, profile: Path) -> None:
+    def __init__(self, profile: Path, *options: str) -> None:
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
         arguments = [
             chromium(), "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run",
             "--disable-dev-shm-usage", "--disable-background-networking", "--remote-debugging-pipe",
-            f"--user-data-dir={profile}", "about:blank",
+            f"--user-data-dir={profile}", *options, "about:blank",
         ]  # fmt: skip
         # The program reads on 3 and writes on 4; a shell puts our ends there, whatever their numbers are here.
         script = f'exec 3<&{to_read} 4>&{to_write}; exec "$@"'

@@ -12,6 +12,7 @@ from drocap_ros.cli.graph.common import add_start_options, chosen_domain, import
 from drocap_ros.cli.graph.top import dashboard_of
 from drocap_ros.cli.options import Subparsers, add_command, add_config_option, add_models_option
 from drocap_ros.cli.running import stop_signals
+from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
 
@@ -29,13 +30,22 @@ def add_parser(subparsers: Subparsers) -> None:
         help="bring the graph up on real hardware",
         description="Start the nodes and run until the source ends or Ctrl-C. Each in a process of its own.",
     )
-    add_config_option(parser, required=True)
+    add_config_option(parser)
     add_models_option(parser)
-    parser.add_argument("--source", metavar="URI", help="replaces the configuration's image_ingest.source")
+    parser.add_argument(
+        "--source",
+        metavar="URI",
+        help="replaces the configuration's image_ingest.source; 0 = the first camera of this computer. Without --config"
+        " neither an autopilot is asked nor, without --session, a recording made",
+    )
     parser.add_argument("--session", metavar="DIR", type=Path, help="record to this new folder")
     parser.add_argument(
         "--nodes", nargs="+", metavar="NODE", help="names of nodes (default: image_ingest to session_recorder)"
     )
+    parser.add_argument(
+        "--vmc", metavar="HOST:PORT", help="send the newest pose there by VMC (VSeeFace, Unity, Unreal, Blender)"
+    )
+    parser.add_argument("--websocket", metavar="HOST:PORT", help="serve the newest pose there as JSON by a WebSocket")
     add_run_options(parser)
 
 
@@ -50,14 +60,38 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
 
+    if not (args.config or args.source):
+        raise InputError("live: expected --config or --source, got neither; name a file of parameters or a camera")
     config = load_config(args.config)
     if args.source:
-        config = config.replace("image_ingest", source=args.source)
+        camera = f"/dev/video{args.source}" if args.source.isdecimal() else args.source
+        config = config.replace("image_ingest", source=camera)
     if args.models:
         config = config.replace("pose_estimator", models_dir=str(models_folder(args.models).absolute()))
     if args.session:
         config = config.replace("session_recorder", session_dir=str(args.session.absolute()))
-    return run_graph(config, args.nodes or live_nodes(), args)
+    nodes = args.nodes or live_nodes()
+    if not (args.config or args.nodes):
+        left_out = {"mavlink_bridge"} if args.session else {"mavlink_bridge", "session_recorder"}
+        nodes = [name for name in nodes if name not in left_out]
+    config = _with_receivers(config, args)
+    if config.stream_out.vmc or config.stream_out.websocket:
+        nodes = [*nodes, "stream_out"]
+    return run_graph(config, nodes, args)
+
+
+def _with_receivers(config: DrocapConfig, args: argparse.Namespace) -> DrocapConfig:
+    """The configuration with what the options say; a WebSocket that the network reaches is named on stderr."""
+    from drocap_ros.export.stream_out_config import address_of, is_loopback
+
+    given = {name: getattr(args, name) for name in ("vmc", "websocket") if getattr(args, name)}
+    for name, text in given.items():
+        address_of(text, f"--{name}")
+    config = config.replace("stream_out", **given)
+    socket = config.stream_out.websocket
+    if socket and not is_loopback(address_of(socket, "websocket")[0]):
+        print(f"drocap: warning: whoever reaches {socket} may read the pose of the person", file=sys.stderr)
+    return config
 
 
 def live_nodes() -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: A running bridge publishes its status five times a second; discovery may take longer.
 _FIND_S = 2.0
+#: Rates at which a bridge publishes its status and, usually, its state.
+_STATUS_HZ, _STATE_HZ = 5.0, 50.0
 _STATE_FIELDS = (
     "autopilot",
     "mode",
@@ -56,17 +58,18 @@ class _Reported(Condition):
 
 
 class BridgeListener:
-    """Collects the messages of one bridge."""
+    """Collects the messages of one bridge, those of about the last ``keep_s``."""
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: Graph, keep_s: float = 300.0) -> None:
         from drocap_ros.ros.topics import TOPICS
 
-        self.statuses: list[Message] = []
-        self.states: list[tuple[float, Message]] = []  # age at the arrival, message
+        self.statuses: deque[Message] = deque(maxlen=round(_STATUS_HZ * keep_s))
+        # Age at the arrival, message.
+        self.states: deque[tuple[float, Message]] = deque(maxlen=round(_STATE_HZ * keep_s))
         self.values: dict[str, str] = {}
         self._graph = graph
         takers = {
-            "orbit/status": self.statuses.append,
+            "orbit/status": lambda message: self.statuses.append(message),
             "vehicle/state": self._take_state,
             "/diagnostics": self._take_diagnostics,
         }
@@ -121,7 +124,7 @@ class BridgeListener:
             streams=streams,
             round_trips_s=trips_s[np.isfinite(trips_s)],
             settings={name: number(text) for name, text in self.values.items() if name in known},
-            delays_s=np.array([age for age, _ in self.states]),
+            delays_s=np.array([age for age, _ in list(self.states)]),
             conditions=self._failed(),
             bridge=f"by the running bridge in {namespace}, {state}: {status.reason}",
         )

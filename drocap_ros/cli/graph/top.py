@@ -27,6 +27,9 @@ _LATENCY = (Key.LATENCY_P50, Key.LATENCY_P95, Key.LATENCY_P99)
 _SHOWN = (Key.SUBJECT, Key.LAST_REFUSED)
 
 
+COLUMNS = ("node", "state", "Hz", "latency, ms (p50 / p95 / p99)", "status", "counts")
+
+
 class Dashboard:
     """Latest ``/diagnostics`` status of each node."""
 
@@ -45,24 +48,37 @@ class Dashboard:
         inside = f"{namespace.strip('/')}/" if namespace else ""
         return sorted(name for name in self._rows if name.startswith(inside))
 
+    def rows(self, namespace: str = "") -> list[dict[str, str]]:
+        """Row of each node whose status has arrived, in a namespace: words by column, and the colour of its state."""
+        return [self._row(name, *self._rows[name]) for name in self.heard(namespace)]
+
+    def _row(self, name: str, level: int, text: str, values: dict[str, str]) -> dict[str, str]:
+        counts = ", ".join(
+            f"{words(key)} {value}"
+            for key, value in values.items()
+            if key != Key.PASSED_OVER and (value.isdigit() or key in _SHOWN)
+        )
+        state, colour = _LEVELS.get(level, (str(level), "white"))
+        latency = " / ".join(f"{number(values[key]):.0f}" for key in _LATENCY if key in values)
+        cells = (name, state, values.get(Key.RATE, ""), latency, text, counts)
+        return dict(zip(COLUMNS, cells, strict=True)) | {"colour": colour}
+
+    def is_active(self, name: str) -> bool | None:
+        """Whether a managed node works; None = it is not there."""
+        lifecycle = self._rows[name][2].get(Key.LIFECYCLE) if name in self._rows else None
+        return None if lifecycle is None else lifecycle == "active"
+
     def table(self, namespace: str = "") -> Table:
         """Table of the nodes whose status has arrived, in a namespace."""
         from rich.table import Table
         from rich.text import Text
 
-        table = Table("node", "state", "Hz", "latency, ms (p50 / p95 / p99)", "status", "counts", expand=True)
-        for name in self.heard(namespace):
-            level, text, values = self._rows[name]
-            counts = ", ".join(
-                f"{words(key)} {value}"
-                for key, value in values.items()
-                if key != Key.PASSED_OVER and (value.isdigit() or key in _SHOWN)
-            )
-            state, colour = _LEVELS.get(level, (str(level), "white"))
-            latency = " / ".join(f"{number(values[key]):.0f}" for key in _LATENCY if key in values)
+        table = Table(*COLUMNS, expand=True)
+        for row in self.rows(namespace):
             # As Text: words of nodes, and of messages that they refused, may hold brackets, which are markup.
-            shown, rate, status, amounts = map(Text, (name, values.get(Key.RATE, ""), text, counts))
-            table.add_row(shown, Text(state, colour), rate, latency, status, amounts)
+            shown, _, rate, latency, status, amounts = (row[name] for name in COLUMNS)
+            state = Text(row["state"], row["colour"])
+            table.add_row(Text(shown), state, Text(rate), latency, Text(status), Text(amounts))
         table.caption = Text(self._keeping_up(self.heard(namespace)))
         return table
 
