@@ -1,41 +1,52 @@
-"""``ros2 launch drocap_ros drocap.launch.py config:=FILE``: the start-up of ``drocap live``.
-
-The command starts, watches and restarts its nodes itself, so launch runs the command instead of single nodes.
-"""
-
-import sys
+"""``ros2 launch drocap_ros drocap.launch.py config:=FILE``: the nodes of ``drocap live``, each restarted by launch."""
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
 
 from drocap_ros.ros.topics import NODES
 
-NO = ("false", "False", "0", "no")
+YES, NO = ("true", "True", "1", "yes"), ("", "false", "False", "0", "no")
+#: Name -> default and description.
+ARGUMENTS = {
+    "config": (None, "parameters of the components (YAML)"),
+    "namespace": ("/drocap", "of all topics"),
+    "source": ("", "replaces the configuration's image_ingest.source: a video, a camera, a URL, topic:NAME"),
+    "record": ("false", "true, false, or the new folder of the session"),
+    "autopilot": ("true", "whether mavlink_bridge runs"),
+    "respawn": ("true", "whether a node that ends is started again; false for a video, which ends"),
+}
 
 
 def generate_launch_description():
-    """Arguments and the one process."""
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("config", description="parameters of the components (YAML)"),
-            DeclareLaunchArgument("namespace", default_value="/drocap", description="of all topics"),
-            DeclareLaunchArgument(
-                "record", default_value="true", description="true, false, or the new folder of the session"
-            ),
-            OpaqueFunction(function=live),
-        ]
-    )
+    """Arguments and nodes."""
+    arguments = [
+        DeclareLaunchArgument(name, description=words, **({} if default is None else {"default_value": default}))
+        for name, (default, words) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=nodes)])
 
 
-def live(context):
-    """``drocap live`` with the arguments of the launch."""
-    config, namespace, record = (
-        LaunchConfiguration(name).perform(context) for name in ("config", "namespace", "record")
-    )
-    command = [sys.executable, "-m", "drocap_ros.cli", "live", "--config", config, "--namespace", namespace]
-    if record in NO:
-        command += ["--nodes", *(name for name, node in NODES.items() if node.live and name != "session_recorder")]
-    elif record not in ("true", "True", "1", "yes"):
-        command += ["--session", record]
-    return [ExecuteProcess(cmd=command, output="screen", on_exit=Shutdown())]
+def nodes(context):
+    """The nodes by the arguments of the launch."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    left_out = {"session_recorder"} if given["record"] in NO else set()
+    left_out |= {"mavlink_bridge"} if given["autopilot"] in NO else set()
+    more = {"image_ingest": {"source": given["source"]}} if given["source"] else {}
+    if given["record"] not in (*YES, *NO):
+        more["session_recorder"] = {"session_dir": given["record"]}
+    return [
+        Node(
+            package="drocap_ros",
+            executable=name,
+            name=name,
+            namespace=given["namespace"],
+            parameters=[given["config"], more.get(name, {})],
+            respawn=given["respawn"] in YES,
+            respawn_delay=1.0,
+            output="screen",
+        )
+        for name, entry in NODES.items()
+        if entry.live and name not in left_out
+    ]

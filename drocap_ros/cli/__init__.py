@@ -17,12 +17,15 @@ from drocap_ros.cli.options import LineParser
 from drocap_ros.cli.running import BOTH, interruptible
 from drocap_ros.errors import DrocapError, InputError
 
-#: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
-COMMANDS = (
-    "demo.command", "graph.live", "graph.preflight", "graph.station", "view", "graph.orbit", "graph.record",
-    "graph.replay", "app", "sample", "track", "reconstruct", "batch", "export", "report", "info", "recover",
-    "graph.top", "models", "calibrate", "evaluate",
-)  # fmt: skip
+#: Modules under ``drocap_ros.cli`` by what a user wants, in the order of ``drocap --help``.
+COMMANDS = {
+    "a video to a motion": ("app", "reconstruct", "export", "report", "view", "sample", "track", "batch"),
+    "a flight": (
+        *("graph.preflight", "graph.live", "graph.station", "graph.orbit", "graph.top"),
+        *("graph.record", "graph.replay", "recover", "demo.command"),
+    ),
+    "files, networks, figures": ("info", "models", "calibrate", "evaluate"),
+}
 
 
 class _PrintCompletion(argparse.Action):
@@ -42,8 +45,9 @@ def build_parser() -> LineParser:
     """Parser of the whole command line."""
     parser = LineParser(
         prog="drocap",
+        usage="drocap COMMAND ... (drocap COMMAND --help: its options)",
         description="Human motion capture with one drone: 3D motion of a person from the video of an orbiting camera.",
-        epilog="Exit status: 0 done, 2 the input or the options cannot be used, 130 interrupted, 1 anything else.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"drocap {__version__}")
     parser.add_argument(
@@ -52,9 +56,18 @@ def build_parser() -> LineParser:
         choices=("bash", "zsh", "fish"),
         help='completion by the Tab key; into ~/.bashrc: eval "$(drocap --completion bash)"',
     )
-    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for name in COMMANDS:
-        importlib.import_module(f"drocap_ros.cli.{name}").add_parser(subparsers)
+    subparsers = parser.add_subparsers(
+        prog="drocap", dest="command", metavar="COMMAND", required=True, help=argparse.SUPPRESS
+    )
+    lines = []
+    for group, names in COMMANDS.items():
+        before = len(subparsers.choices)
+        for name in names:
+            importlib.import_module(f"drocap_ros.cli.{name}").add_parser(subparsers)
+        helps = [f"  {action.dest:<12}{action.help}" for action in subparsers._choices_actions[before:]]
+        lines += [f"{group}:", *helps, ""]
+    status = "Exit status: 0 done, 2 the input or the options cannot be used, 130 interrupted, 1 anything else."
+    parser.epilog = "\n".join([*lines, status])
     return parser
 
 

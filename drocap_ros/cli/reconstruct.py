@@ -52,11 +52,9 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="INPUT",
         type=Path,
         help="video file, image folder, .mcap, rosbag1 .bag, rosbag2 folder, tracks .npz, or 2D keypoints of another"
-        " tool (.json or a folder of them, .csv, .npz, .npy)",
+        " tool (.json or a folder of them, .csv, .npz, .npy); with --together several",
     )
-    parser.add_argument(
-        "further", metavar="INPUT", nargs="*", type=Path, help="with --together: other recordings of the same motion"
-    )
+    parser.add_argument("further", metavar="INPUT", nargs="*", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: INPUT's name + _motion)")
     parser.add_argument(
         "--together",

@@ -35,7 +35,11 @@ def test_help_lists_every_command(capsys):
     with pytest.raises(SystemExit) as done:
         main(["--help"])
     assert done.value.code == 0
-    assert len([line for line in capsys.readouterr().out.splitlines() if line.startswith("    ")]) >= len(COMMANDS)
+    lines = capsys.readouterr().out.splitlines()
+    for group, names in COMMANDS.items():
+        at = lines.index(f"{group}:")
+        listed = [line.split()[0] for line in lines[at + 1 : at + 1 + len(names)]]
+        assert listed == [name.removesuffix(".command").rsplit(".")[-1] for name in names]
 
 
 @pytest.mark.parametrize(

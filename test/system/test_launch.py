@@ -1,46 +1,75 @@
-"""The launch file; the ROS wheels have no ``launch``, so it is read, not run."""
+"""The launch file; the ROS wheels have no ``launch``, so its description is made with the names that it imports."""
 
-import ast
 import re
+import runpy
+import sys
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from drocap_ros.cli.graph import live
+from drocap_ros.config import section_types
 from drocap_ros.ros.topics import NODES
 
 
-@pytest.fixture(scope="module")
-def tree(root):
-    path = root / "launch" / "drocap.launch.py"
-    compile(path.read_text(), str(path), "exec")
-    return ast.parse(path.read_text())
+@pytest.fixture
+def launch(root, monkeypatch):
+    """A function of the launch's arguments that gives the nodes by name."""
+
+    def record(kind):
+        return lambda *args, **more: SimpleNamespace(kind=kind, args=args, **more)
+
+    given = {}
+
+    class Configuration:
+        def __init__(self, name):
+            self.perform = lambda _: given[name]
+
+    for module, names in {
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {name: record(name) for name in ("DeclareLaunchArgument", "OpaqueFunction")},
+        "launch.substitutions": {"LaunchConfiguration": Configuration},
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": record("Node")},
+    }.items():
+        stand_in = ModuleType(module)
+        vars(stand_in).update(names)
+        monkeypatch.setitem(sys.modules, module, stand_in)
+    *declared, made = runpy.run_path(str(root / "launch" / "drocap.launch.py"))["generate_launch_description"]()
+
+    def start(**arguments):
+        given.update({action.args[0]: getattr(action, "default_value", None) for action in declared})
+        assert set(arguments) <= set(given)
+        given.update(arguments)
+        return {node.name: node for node in made.function(None)}
+
+    return start
 
 
-def strings(tree):
-    return [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+def test_every_node_is_a_process_of_its_own_that_is_restarted(launch):
+    nodes = launch(config="mine.yaml")
+    assert list(nodes) == [name for name, entry in NODES.items() if entry.live and name != "session_recorder"]
+    for name, node in nodes.items():
+        assert (node.package, node.executable, node.namespace) == ("drocap_ros", name, "/drocap")
+        assert node.parameters[0] == "mine.yaml"
+        assert node.respawn
 
 
-def test_arguments_are_config_namespace_and_record(tree):
-    calls = [
-        n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "DeclareLaunchArgument"
-    ]
-    assert [call.args[0].value for call in calls] == ["config", "namespace", "record"]
+@pytest.mark.parametrize(("record", "folder"), [("true", None), ("/data/flight", "/data/flight")])
+def test_a_session_is_recorded_on_demand(launch, record, folder):
+    recorder = launch(config="mine.yaml", record=record)["session_recorder"]
+    assert recorder.parameters[1] == ({"session_dir": folder} if folder else {})
 
 
-def test_its_options_are_those_of_drocap_live(tree):
-    import argparse
-
-    commands = argparse.ArgumentParser().add_subparsers()
-    live.add_parser(commands)
-    options = {text for text in strings(tree) if re.fullmatch(r"--[a-z-]+", text)}
-    assert options >= {"--config", "--namespace", "--session", "--nodes"}
-    listed = commands.choices["live"].format_help()
-    assert all(option in listed for option in options)
+def test_a_video_without_a_drone(launch):
+    nodes = launch(config="mine.yaml", source="walk.mp4", autopilot="false", respawn="false")
+    assert "mavlink_bridge" not in nodes
+    assert not any(node.respawn for node in nodes.values())
+    assert nodes["image_ingest"].parameters[1] == {"source": "walk.mp4"}
 
 
-def test_the_node_that_it_leaves_out_exists(tree):
-    assert "session_recorder" in strings(tree)
-    assert NODES["session_recorder"].live
+def test_parameters_that_it_sets_exist(launch):
+    for name, node in launch(config="mine.yaml", source="0", record="/data/flight").items():
+        assert set(node.parameters[1]) <= set(section_types()[name].__dataclass_fields__)
 
 
 def test_launch_folder_and_all_nodes_are_installed(root):
