@@ -61,6 +61,7 @@ def export(
     from drocap_ros.export.opensim import write_mot
     from drocap_ros.export.usd import write_fbx, write_usd
     from drocap_ros.motion import Motion, load_motion
+    from drocap_ros.report.movement import bend_deviations
 
     whole = motion if isinstance(motion, Motion) else load_motion(motion)
     writers: dict[str, Callable[..., tuple[str, ...]]] = {
@@ -68,7 +69,7 @@ def export(
         "c3d": write_c3d,
         "trc": write_trc,
         "csv": write_csv,
-        "csv-angles": write_csv_angles,
+        "csv-angles": lambda path, take: write_csv_angles(path, take, bend_deviations(whole)),
         "glb": write_glb,
         "mot": write_mot,
         "usd": functools.partial(write_usd, motion=whole),

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -106,12 +107,33 @@ _ISB = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
-def write_csv_angles(path: Path, take: Take) -> tuple[str, ...]:
-    """Write a table: ``time_s``, ``frame`` (from 0), and a column ``NAME_deg`` per joint angle; returns notes."""
+#: Bends (degrees) that no body has, beyond the widest ranges of healthy people: an error of the motion.
+_POSSIBLE = {"knee_flexion": (-20.0, 165.0), "elbow_flexion": (-20.0, 165.0), "hip_flexion": (-60.0, 150.0)}
+
+
+def write_csv_angles(path: Path, take: Take, deviations: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Write a table: ``time_s``, ``frame`` (from 0), ``NAME_deg``, ``NAME_sd_deg``, ``possible``; returns notes.
+
+    deviations : knee, hip, elbow -> (F, 2) degrees, right and left
+    """
     take = y_up(take)
     body, notes = body_of(take)
     angles = joint_angles(body, take.rate_hz)
-    write_table(path, take.times_s, [f"{name}_deg" for name in angles], np.stack(list(angles.values()), axis=1))
+    columns = {f"{name}_deg": values for name, values in angles.items()}
+    for joint, both in deviations.items():
+        columns |= {f"{side}_{joint}_flexion_sd_deg": both[:, at] for at, side in enumerate(("right", "left"))}
+    possible = np.ones(len(take.times_s), bool)
+    for name, (low, high) in _POSSIBLE.items():
+        for side in ("right", "left"):
+            angle = angles[f"{side}_{name}"]
+            beyond = (angle < low) | (angle > high)
+            possible &= ~beyond
+            if beyond.any():
+                worst = int(np.abs(np.where(beyond, angle, 0.0)).argmax())
+                where = f"{angle[worst]:.0f} degrees at {take.times_s[worst]:.2f} s"
+                notes = (*notes, f"{side} {name.replace('_', ' ')} that no body has: {where}, {beyond.sum()} frames")
+    columns["possible"] = possible.astype(float)
+    write_table(path, take.times_s, list(columns), np.stack(list(columns.values()), axis=1))
     return notes
 
 

@@ -116,13 +116,18 @@ def _angles(motion: Motion, frames: np.ndarray) -> Iterator[Curve]:
         angles = flexion(joints, motion.joints)
     except InputError:
         return
-    covariance = _about_pelvis(motion, frames)
-    deviations = {} if covariance is None else _deviations(joints, motion.joints, covariance)
+    deviations = bend_deviations(motion, frames)
     for joint, words in _ANGLES.items():
         yield Curve(f"{joint.capitalize()} bend", "°", words, _BOTH, angles[joint], deviations.get(joint))
 
 
-def _about_pelvis(motion: Motion, frames: np.ndarray) -> np.ndarray | None:
+def bend_deviations(motion: Motion, frames: np.ndarray | slice = slice(None)) -> dict[str, np.ndarray]:
+    """Knee, hip, elbow -> (N, 2) deg, standard deviations of the bends, right and left; nothing where unknown."""
+    covariance = _about_pelvis(motion, frames)
+    return {} if covariance is None else _deviations(upright_joints(motion)[frames], motion.joints, covariance)
+
+
+def _about_pelvis(motion: Motion, frames: np.ndarray | slice) -> np.ndarray | None:
     """(F, P, 3, 3) m^2 of joints about the pelvis: an error that all joints share turns no limb."""
     if motion.covariance is None or "pelvis" not in motion.joints:
         return None

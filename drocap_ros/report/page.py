@@ -264,15 +264,33 @@ def _number(value: float, form: str) -> str:
     return format(value, form) if np.isfinite(value) else "-"
 
 
+def _grouped(results: list[Finding]) -> list[tuple[Severity, str, str]]:
+    """Severity, title and text of each check; what several persons share is said once, with their numbers."""
+    groups: dict[tuple[Severity, MotionCheck], list[Finding]] = {}
+    for result in results:
+        groups.setdefault((result.severity, result.check), []).append(result)
+    said = []
+    for (severity, check), found in groups.items():
+        found.sort(key=lambda result: result.person or 0)
+        persons = ", ".join(str(result.person) for result in found if result.person is not None)
+        text = (
+            found[0].text
+            if len({result.text for result in found}) == 1
+            else " ".join(f"{result.person}: {result.text}" for result in found)
+        )
+        said.append((severity, f"{check.title} (person {persons})" if persons else check.title, text))
+    return said
+
+
 def _badge(results: list[Finding]) -> str:
-    titles = [result.title for result in results if result.severity is Severity.WARNING]
+    titles = [title for severity, title, _ in _grouped(results) if severity is Severity.WARNING]
     if not titles:
         return '<span class="badge">no warnings</span>'
     return f'<span class="badge warning">{len(titles)} to read below: {escape(", ".join(titles))}</span>'
 
 
 def _checks(results: list[Finding]) -> str:
-    items = [(result.severity.value, result.title, result.text) for result in results]
+    items = [(severity.value, title, text) for severity, title, text in _grouped(results)]
     if not any(result.severity is Severity.WARNING for result in results):
         items.insert(0, ("good", "No warnings", "No automatic check doubts this motion."))
     return "".join(f'<li class="{kind}"><b>{escape(title)}</b> {escape(text)}</li>' for kind, title, text in items)

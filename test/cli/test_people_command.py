@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,9 @@ def test_report_holds_everybody(out: Path) -> None:
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "3D motion of 3 persons" in page
     assert '"people":[{"name":"1"' in page
+    said = re.findall(r'<li class="(\w+)"><b>([^<]*) \(person ([^<]*)\)</b>', page)
+    assert any(persons == "1, 2, 3" for _, _, persons in said)
+    assert len({(kind, title) for kind, title, _ in said}) == len(said)  # each once, with its persons
 
 
 def test_exports_and_a_further_report_are_of_everybody(out: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from drocap_ros.export.measured import joint_angles
 from drocap_ros.export.rigid_body import fit_rigid_body
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import save_motion
+from drocap_ros.report.movement import bend_deviations
 from drocap_ros.skeleton import BODY_15
 
 FRAMES = 120
@@ -135,6 +136,27 @@ def test_command_writes_a_table_of_angles(walker, walk, tmp_path, capsys):
     assert head[:3] == ["time_s", "frame", "pelvis_rotation_deg"]
     values = np.array(rows, float)
     expected = angles_of(walk[:48])
-    assert values.shape == (48, 2 + len(expected))
+    deviations = [name for name in head if name.endswith("_sd_deg")]
+    assert values.shape == (48, 2 + len(expected) + len(deviations) + 1)
+    assert values[:, head.index("possible")].all()
     column = head.index("right_knee_flexion_deg")
     np.testing.assert_allclose(values[:, column], expected["right_knee_flexion"], atol=0.1)
+
+
+def test_what_no_body_has_is_marked_and_deviations_are_those_of_the_report(walker, walk, tmp_path, capsys):
+    joints = walk[:48].copy()
+    names = {name: BODY_15.index(name) for name in BODY_15.joints}
+    hip, knee = joints[:, names["rhip"]], joints[:, names["rknee"]]
+    thigh = knee - hip
+    joints[20:24, names["rankle"]] = knee[20:24] + (-0.97 * thigh + 0.2 * np.roll(thigh, 1, axis=1))[20:24]
+    covariance = np.tile([1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4], (48, 15, 1))
+    motion = dataclasses.replace(walker, joints3d=joints, covariance=covariance, meta={"covariance_about": "pelvis"})
+    save_motion(tmp_path / "motion.npz", motion)
+    assert main(["export", str(tmp_path), "--to", "csv-angles"]) == 0
+    assert "right knee flexion that no body has: " in capsys.readouterr().out
+    with (tmp_path / "motion.angles.csv").open(newline="") as file:
+        head, *rows = list(csv.reader(file))
+    values = {name: np.array([float(row[at]) for row in rows]) for at, name in enumerate(head)}
+    assert set(np.flatnonzero(values["possible"] == 0)) == {20, 21, 22, 23}
+    expected = bend_deviations(motion)
+    np.testing.assert_allclose(values["left_knee_flexion_sd_deg"], expected["knee"][:, 1], atol=1e-5)
