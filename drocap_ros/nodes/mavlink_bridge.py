@@ -37,7 +37,9 @@ from drocap_ros.recording.pose_messages import lens_of
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode, MessageInfo
 from drocap_ros.ros.conversions import (
     MAP,
+    fix_to_ros,
     header_at,
+    odometry_to_ros,
     pose2d_from_ros,
     stamp_from_ros,
     transform_to_ros,
@@ -79,6 +81,7 @@ class MavlinkBridgeNode(ComponentNode):
         self._guardian: GuardianProcess | None = None
         self.controller = OrbitController(self._link, self.config, self._watchdog)
         self._states = self.output("vehicle/state")
+        self._derived = ((self.output("vehicle/odometry"), odometry_to_ros), (self.output("vehicle/fix"), fix_to_ros))
         self._statuses = self.output("orbit/status")
         self._tf = self.output("/tf") if TFMessage is not None else None
         self.input("camera_info", self._on_camera_info)
@@ -208,6 +211,9 @@ class MavlinkBridgeNode(ComponentNode):
     def _on_state(self, state: VehicleState) -> None:
         self.controller.on_state(state)
         self._states.publish(vehicle_state_to_ros(state))
+        for output, message in self._derived:
+            if output.get_subscription_count():
+                output.publish(message(state))
         self.count(Key.VEHICLE_STATES)
         if self._tf is not None:
             transforms = vehicle_transforms(state)

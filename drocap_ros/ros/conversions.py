@@ -7,15 +7,16 @@ from array import array
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
+from geometry_msgs.msg import Point, Quaternion, TransformStamped, Vector3
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, CompressedImage
+from sensor_msgs.msg import CameraInfo, CompressedImage, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
 from drocap_ros.background import FixedPoints
 from drocap_ros.flight.vehicle import VehicleState as VehicleStateData
 from drocap_ros.geometry.lens import CameraModel
-from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.reconstruction.live.initializer import LivePose
@@ -217,3 +218,31 @@ def vehicle_state_to_ros(state: VehicleStateData) -> VehicleState:
             arrays = isinstance(value, np.ndarray)
             setattr(message, name, value.astype(getattr(message, name).dtype) if arrays else value)
     return message
+
+
+def odometry_to_ros(state: VehicleStateData) -> Odometry:
+    """Pose of ``base_link`` in ``map``, and its velocity in ``base_link`` (REP 105, REP 147), of a vehicle state."""
+    message = Odometry(header=header_at(state.stamp_ns, MAP), child_frame_id="base_link")
+    x, y, z = (float(v) for v in state.position_enu_m)
+    message.pose.pose.position = Point(x=x, y=y, z=z)
+    message.pose.pose.orientation = quaternion_to_ros(state.orientation_xyzw)
+    velocity = state.velocity_enu_m_s @ matrix_from_quaternion(state.orientation_xyzw)
+    x, y, z = (float(v) for v in velocity)
+    message.twist.twist.linear = Vector3(x=x, y=y, z=z)
+    x, y, z = (float(v) for v in state.angular_velocity_flu_rad_s)
+    message.twist.twist.angular = Vector3(x=x, y=y, z=z)
+    return message
+
+
+def fix_to_ros(state: VehicleStateData) -> NavSatFix:
+    """Position on earth of a vehicle state; its altitude above the ellipsoid is not known, NaN."""
+    # By MAVLink's GPS_FIX_TYPE: 3D, differential, RTK.
+    kinds = {3: NavSatStatus.STATUS_FIX, 4: NavSatStatus.STATUS_SBAS_FIX, 5: NavSatStatus.STATUS_GBAS_FIX}
+    status = kinds.get(min(state.gps_fix_type, 5), NavSatStatus.STATUS_NO_FIX)
+    return NavSatFix(
+        header=header_at(state.stamp_ns, "base_link"),
+        status=NavSatStatus(status=status, service=NavSatStatus.SERVICE_GPS),
+        latitude=float(state.latitude_deg),
+        longitude=float(state.longitude_deg),
+        altitude=math.nan,
+    )

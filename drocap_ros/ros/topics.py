@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, CompressedImage, NavSatFix, RegionOfInterest
 from visualization_msgs.msg import ImageMarker, MarkerArray
 
 from drocap_ros.msg import BackgroundTracks, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
@@ -60,6 +61,8 @@ TOPICS: dict[str, Topic] = {
     "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS, one_clock=True),
     "pose3d/latest": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "vehicle/state": Topic(VehicleState, RESULT_QOS, one_clock=True),
+    "vehicle/odometry": Topic(Odometry, RESULT_QOS),
+    "vehicle/fix": Topic(NavSatFix, RESULT_QOS),
     "orbit/status": Topic(OrbitStatus, RESULT_QOS),
     "markers/keypoints": Topic(ImageMarker, RESULT_QOS),
     "markers/initial": Topic(MarkerArray, RESULT_QOS),
@@ -67,6 +70,8 @@ TOPICS: dict[str, Topic] = {
     "markers/camera_path": Topic(MarkerArray, RESULT_QOS),
     "/diagnostics": Topic(DiagnosticArray, RESULT_QOS),
 }
+#: What `vehicle/state` says already, for programs of others: no session holds it.
+DERIVED = frozenset({"vehicle/odometry", "vehicle/fix"})
 #: Topics that nodes of other packages may publish: an incompatible quality of service is logged.
 FROM_OUTSIDE = frozenset({"image/compressed", "camera_info", "roi", "vehicle/state"})
 if TFMessage is not None:
@@ -105,7 +110,7 @@ NODES: dict[str, NodeEntry] = {
         niceness=3,  # its adjustments, which have a process of their own, 19
     ),
     "mavlink_bridge": NodeEntry(
-        ("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status"), live=True
+        ("vehicle/state", *sorted(DERIVED), "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status"), live=True
     ),
     "visualizer": NodeEntry(
         ("markers/keypoints", "markers/initial", "markers/latest", "markers/camera_path", *_TF),
@@ -117,7 +122,7 @@ NODES: dict[str, NodeEntry] = {
     "stream_out": NodeEntry((), ("pose3d/initial", "pose3d/latest", *_TF), niceness=3),  # as what makes the newest pose
     # The topics that it publishes are those of the session.
     "session_player": NodeEntry(source=True),
-    "session_recorder": NodeEntry((), tuple(TOPICS), live=True, niceness=10),
+    "session_recorder": NodeEntry((), tuple(name for name in TOPICS if name not in DERIVED), live=True, niceness=10),
 }
 
 

@@ -152,3 +152,33 @@ def test_unknown_values_of_the_vehicle_stay_nan():
 def test_stamps_keep_every_nanosecond():
     for stamp in (0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789):
         assert c.stamp_from_ros(c.stamp_to_ros(stamp)) == stamp
+
+
+def test_odometry_and_fix_say_what_the_vehicle_state_says():
+    half = np.sqrt(0.5)
+    state = VehicleState(
+        stamp_ns=3_000_000_001,
+        position_enu_m=np.array([1.0, 2.0, 3.0]),
+        velocity_enu_m_s=np.array([0.0, 4.0, 1.0]),  # the vehicle looks north and flies on
+        orientation_xyzw=np.array([0.0, 0.0, half, half]),
+        angular_velocity_flu_rad_s=np.array([0.1, 0.2, 0.3]),
+        latitude_deg=47.5,
+        longitude_deg=8.5,
+        gps_fix_type=3,
+    )
+    odometry = c.odometry_to_ros(state)
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "base_link")
+    assert (odometry.header.stamp.sec, odometry.header.stamp.nanosec) == (3, 1)
+    assert odometry.pose.pose.position.y == 2.0
+    linear, angular = odometry.twist.twist.linear, odometry.twist.twist.angular
+    np.testing.assert_allclose([linear.x, linear.y, linear.z], [4.0, 0.0, 1.0], atol=1e-12)
+    assert angular.z == 0.3
+    fix = c.fix_to_ros(state)
+    assert (fix.latitude, fix.longitude, fix.status.status) == (47.5, 8.5, 0)
+    assert np.isnan(fix.altitude)
+
+
+def test_what_is_not_known_is_nan_and_no_fix():
+    state = VehicleState(stamp_ns=0)
+    assert np.isnan(c.odometry_to_ros(state).twist.twist.linear.x)
+    assert c.fix_to_ros(state).status.status == -1
