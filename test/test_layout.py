@@ -37,8 +37,8 @@ BUDGETS = {
     ("simulation",): 3.45,  # reports err as recorded ones
     ("evaluation",): 1.08,  # truth from C3D, TRC and BVH by the names of other programs (0.34), one of several bodies
     ("export", "report", "view"): 4.76,  # OpenSim, USD and FBX (0.17), an avatar's bones live (0.29), several persons
-    ("ros", "nodes", "bringup"): 4.78,  # lockstep, processes of their own; poses to other programs (0.21)
-    ("station",): 0.88,  # one page in a browser for the flight
+    ("ros", "nodes", "bringup"): 4.80,  # lockstep, processes of their own; poses to other programs (0.21)
+    ("station",): 0.85,  # one page in a browser for the flight
     ("cli",): 4.86,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06), a page for flights (0.09)
     ("lab", "benchmarks"): 11.75,  # flights that are drawn (0.35), mutants of the product (0.17), heights (0.08)
 }  # fmt: skip
