@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 _OLD_S = 0.5
 #: A path's windows, each with its camera, come every second or two; after this time there is none any more.
 _UP_S = 5.0
-#: Share of a period after which the newest pose is sent again: a timer may be early.
-_DUE = 0.9
 #: To wait for an event loop, s.
 _LOOP_S = 5.0
 
@@ -63,7 +61,7 @@ class StreamOutNode(ComponentNode):
         self._up, self._up_s = self._pitched, -math.inf
         self._pose: AvatarPose | None = None
         self._stamp_ns, self._frame = 0, ""
-        self._begin_s, self._came_s, self._sent_s = self.now_s(), -math.inf, -math.inf
+        self._begin_s, self._came_s = self.now_s(), -math.inf
         self._vmc: socket.socket | None = None
         places = []
         if self.config.vmc:
@@ -79,7 +77,7 @@ class StreamOutNode(ComponentNode):
                 f"WebSocket on {self.config.websocket}" + ("" if is_loopback(host) else ", open to the network")
             )
         self._places = "; ".join(places) or "neither vmc nor websocket is set"
-        self.create_timer(1.0 / self.config.rate_hz, self._repeat)
+        self._again = self.create_timer(1.0 / self.config.rate_hz, self._repeat)
 
     def _on_tf(self, data: bytes) -> None:
         """Take the up of a camera in ``odom``; most messages are other frames, so few are read."""
@@ -111,6 +109,7 @@ class StreamOutNode(ComponentNode):
             level = "" if in_world else f", leveled by {known_by}; on the floor, without a place"
             self.details[Key.FRAME] = frame + level
         self._stamp_ns, self._frame, self._came_s = pose.stamp_ns, frame, self.now_s()
+        self._again.reset()
         self._send()
         self.count(Key.POSES)
         self.produced(pose.stamp_ns)
@@ -118,17 +117,14 @@ class StreamOutNode(ComponentNode):
         self.report(OK if self._pose is not None else WARN, self._places + seen)
 
     def _repeat(self) -> None:
-        now_s = self.now_s()
-        if now_s - self._came_s > _OLD_S:
+        if self.now_s() - self._came_s > _OLD_S:
             self._pose = None
-        if now_s - self._sent_s > _DUE / self.config.rate_hz:
-            self._send()
+        self._send()
 
     def _send(self) -> None:
-        self._sent_s = self.now_s()
         if self._vmc is not None:
             try:
-                self._vmc.send(vmc_packet(self._pose, self._sent_s - self._begin_s))
+                self._vmc.send(vmc_packet(self._pose, self.now_s() - self._begin_s))
                 self.count(Key.PACKETS)
             except OSError as error:  # nobody listens yet, or the network is away
                 self.count(Key.PACKETS_REFUSED)
@@ -179,7 +175,7 @@ class WebClients:
             raise web.HTTPForbidden
         client = web.WebSocketResponse(heartbeat=10.0)
         await client.prepare(request)
-        listening = asyncio.ensure_future(client.receive())  # ends with the client; what it says is not asked for
+        listening = asyncio.ensure_future(_until_it_goes(client))
         with contextlib.suppress(ConnectionError):
             while not listening.done() and not client.closed:
                 changed = self._changed
@@ -207,6 +203,12 @@ class WebClients:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(_LOOP_S)
         self._loop.close()
+
+
+async def _until_it_goes(client: web.WebSocketResponse) -> None:
+    """Take what a client says, which nobody has asked for."""
+    async for _ in client:
+        pass
 
 
 def _expect(module: str, package: str) -> None:

@@ -15,12 +15,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from drocap_ros.bringup import free_domain, watch
 from drocap_ros.cli import main
-from drocap_ros.cli.graph import orbit
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.recording.open_session import session_info
 from drocap_ros.ros.topics import RESULT_QOS
 from drocap_ros.simulation.vehicle.loopback import free_udp_port
+from drocap_ros.station.desk import sentence
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES = "/drocap/image/compressed"
@@ -233,7 +233,15 @@ def test_every_command_joins_the_domain_of_the_environment(tmp_path):
 @pytest.mark.parametrize("namespace", ["a-b", "a b", "/a/", "1a", "//"])
 @pytest.mark.parametrize(
     "command",
-    ["record", "replay s", "top --once", "orbit status", "preflight --config c", "live --config c"],
+    [
+        "record",
+        "replay s",
+        "top --once",
+        "orbit status",
+        "preflight --config c",
+        "live --config c",
+        "station --config c",
+    ],
 )
 def test_a_namespace_that_ros_does_not_know_is_refused(command, namespace, capsys):
     assert main([*command.split(), "--namespace", namespace]) == 2
@@ -262,4 +270,4 @@ def test_a_domain_of_the_environment_that_does_not_exist_is_refused(command, mon
 @pytest.mark.parametrize(("condition", "stays"), [(ConditionCode.STOPPED, True), (ConditionCode.SUBJECT_NEAR, False)])
 def test_the_status_of_a_hold_says_that_the_vehicle_gives_way_to_nobody(condition, stays):
     status = SimpleNamespace(state=State.HOLDING, condition=condition, reason="held", radius_m=4.0, height_m=2.5)
-    assert ("stays there, also where somebody walks up to it" in orbit._sentence(status)) == stays
+    assert ("stays there, also where somebody walks up to it" in sentence(status)) == stays

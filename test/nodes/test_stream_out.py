@@ -121,6 +121,20 @@ def test_each_pose_becomes_a_packet_at_once_and_the_newest_is_repeated(receiver)
     assert np.median(late) < 0.05
 
 
+def test_where_poses_come_slower_there_are_thirty_packets_a_second_all_the_same(receiver):
+    address, packets = receiver
+    with bringup(DrocapConfig().replace("stream_out", vmc=address), ["stream_out"]) as graph:
+        walker = Walker(graph)
+        begin = time.monotonic()
+        for i in range(28):  # at 14 Hz, whose period is 2.1 of those
+            walker.publish(i)
+            graph.spin_for(1 / 14)
+        took_s = time.monotonic() - begin
+    came = [p[0] for p in packets if begin < p[0] < begin + took_s]
+    assert len(came) / took_s >= 29
+    assert np.percentile(np.diff(came), 90) < 0.045
+
+
 @pytest.mark.parametrize("stage", ["latest", "initial"])
 def test_the_chosen_topic_is_sent_and_no_other(receiver, stage):
     address, packets = receiver
@@ -263,8 +277,8 @@ def test_taken_address_and_unknown_host_are_one_line(free_port):
     ("words", "expected"),
     [
         (["--vmc", "127.0.0.1:39539"], "expected --config or --source"),
-        (["--source", "x.mp4", "--vmc", "localhost"], "--vmc: expected HOST:PORT"),
-        (["--source", "x.mp4", "--websocket", "127.0.0.1:99999"], "--websocket: expected HOST:PORT"),
+        (["--source", "x.mp4", "--vmc", "localhost"], "vmc: expected HOST:PORT"),
+        (["--source", "x.mp4", "--websocket", "127.0.0.1:99999"], "websocket: expected HOST:PORT"),
         (["--source", "7", "--vmc", "127.0.0.1:39539"], "/dev/video7"),
     ],
 )

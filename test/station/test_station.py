@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drocap_ros.bringup import free_domain, watch
+from drocap_ros.bringup import bringup, free_domain, watch
 from drocap_ros.cli import main
+from drocap_ros.cli.graph.top import dashboard_of
+from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.keypoints import PoseObservation
@@ -223,3 +225,23 @@ def test_a_taken_port_and_a_missing_package_are_one_line(tmp_path, capsys, monke
     assert main(["station", "--config", str(config)]) == 2
     error = capsys.readouterr().err
     assert error == "drocap: station: expected nicegui, found none; run: pip install 'drocap_ros[app]'\n"
+
+
+def test_record_pauses_the_graphs_recorder_and_lets_it_work_again(tmp_path):
+    config = DrocapConfig().replace("session_recorder", session_dir=str(tmp_path / "session"))
+    with (
+        bringup(config, ["session_recorder"]) as running,
+        watch("/drocap", running.domain_id, lean=True) as graph,
+        dashboard_of(graph, show=False) as (dashboard, _),
+    ):
+        recording = lambda: dashboard.is_active("drocap/session_recorder")  # noqa: E731
+        station = Station(graph, MavlinkBridgeConfig(), Views(list, list, recording))
+        station.enter("a")
+        running.wait_until(lambda: recording() is True, 20, "its recording")
+        station.record("b")  # a viewer
+        running.spin_for(1.5)
+        for expected in (False, True):
+            assert recording() is not expected
+            station.record("a")
+            running.wait_until(lambda wanted=expected: recording() is wanted, 20, f"recording {expected}")
+        station.close()

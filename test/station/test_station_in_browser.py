@@ -199,6 +199,7 @@ def test_page_fits_its_window_and_shows_picture_plan_and_preflight(served, width
     served.wait(lambda: page.run("document.querySelectorAll('main svg circle').length") > 10, 20, "keypoints")
     served.wait(lambda: "permission to fly" in page.run("document.body.innerText"), 20, "the preflight")
     assert page.run("document.documentElement.scrollWidth") <= width
+    assert all(url.startswith((served.address, "data:", "blob:")) for url in page.requests)  # there may be no internet
     # The stop stays in view, however far one scrolls.
     page.run("scrollTo(0, document.body.scrollHeight)")
     page.settle()

@@ -85,8 +85,6 @@ def _with_receivers(config: DrocapConfig, args: argparse.Namespace) -> DrocapCon
     from drocap_ros.export.stream_out_config import address_of, is_loopback
 
     given = {name: getattr(args, name) for name in ("vmc", "websocket") if getattr(args, name)}
-    for name, text in given.items():
-        address_of(text, f"--{name}")
     config = config.replace("stream_out", **given)
     socket = config.stream_out.websocket
     if socket and not is_loopback(address_of(socket, "websocket")[0]):

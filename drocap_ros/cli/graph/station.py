@@ -82,9 +82,7 @@ def run(args: argparse.Namespace) -> int:
             address = f"http://{host}:{args.port}/" + (f"?token={token}" if token else "")
             print(f"open {address} in a browser; Ctrl-C stops", flush=True)
             if token:
-                print(
-                    "drocap: warning: the page is not encrypted; whoever reads the network may command", file=sys.stderr
-                )
+                print("drocap: warning: not encrypted; whoever reads the network may command", file=sys.stderr)
             if has_screen() and not args.no_browser:
                 webbrowser.open(address)
             serve(station, sock, token, stop)
