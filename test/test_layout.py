@@ -38,10 +38,10 @@ BUDGETS = {
     ("simulation",): 2.94,  # reports err as recorded ones
     ("evaluation",): 1.07,  # truth from C3D, TRC and BVH by the names of other programs (0.34), one of several bodies
     ("export", "report", "view"): 4.80,  # OpenSim, USD and FBX (0.17), an avatar's bones live (0.29), several persons
-    ("app",): 1.15,  # the page of clips, corrections and exports
-    ("station",): 0.85,  # one page in a browser for the flight
+    ("app",): 1.26,  # the page of clips, corrections and exports
+    ("station",): 0.77,  # one page in a browser for the flight
     ("ros", "nodes", "bringup"): 5.09,  # lockstep, processes of their own; networks beside optical flow, shared images
-    ("cli",): 5.02,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06), networks watched (0.05)
+    ("cli",): 5.03,  # batch, preflight and top stayed whole; lenses by a chessboard (0.06), networks watched (0.05)
     ("lab", "benchmarks"): 12.26,  # flights that are drawn (0.35), mutants (0.17), heights (0.08), recordings (0.5)
 }  # fmt: skip
 #: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.

@@ -24,7 +24,6 @@ class Desk:
         app.get("/library/{key}/report")(self._report)
         app.get("/library/{key}/thumbnail")(self._thumbnail)
         app.get("/library/{key}/frame/{index}")(self._frame)
-        app.on_shutdown(self.close)
 
     def key(self, entry: Entry) -> str:
         """The name of an entry in addresses."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import secrets
+import socket
+import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
@@ -17,7 +19,11 @@ from drocap_ros.app.desk import Desk
 from drocap_ros.app.exports import Exports
 from drocap_ros.app.jobs import Job
 from drocap_ros.app.library import Entry, motions
+from drocap_ros.app.serving import serve
 from drocap_ros.errors import DrocapError
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 
 class Page:
@@ -150,19 +156,17 @@ class Page:
         return status == 0
 
 
-def run(folder: Path, models: Path | None, port: int, show: bool) -> None:
-    """Serve the page on the loopback until it is interrupted."""
+def run(folder: Path, models: Path | None, sock: socket.socket, stop: threading.Event) -> None:
+    """Serve the page until ``stop`` or a signal."""
     desk = Desk(folder, models)
-    ui.run(
-        lambda: Page(desk),
-        host="127.0.0.1",
-        port=port,
-        title="drocap",
-        dark=None,
-        show=show,
-        reload=False,
-        show_welcome_message=False,
-    )
+
+    def build(_: FastAPI) -> None:
+        ui.page("/", title="drocap")(lambda: Page(desk))
+
+    try:
+        serve(build, sock, stop)
+    finally:
+        desk.close()
 
 
 _STYLE = """

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import socket
+import importlib.util
+import webbrowser
 from pathlib import Path
 
 from drocap_ros.cli.options import Subparsers, add_command
+from drocap_ros.cli.running import stop_signals
 from drocap_ros.errors import InputError
 
 
@@ -32,20 +34,18 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(
             f"{args.folder}: expected a folder for clips and motions, found none; make it, or name another"
         )
-    try:
-        from drocap_ros.app import page
-    except ModuleNotFoundError as error:
-        if str(error.name).startswith("drocap_ros"):
-            raise
-        raise InputError(f"app: expected {error.name}, found none; run: pip install 'drocap_ros[app]'") from None
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", args.port))
-        except (OSError, OverflowError):
-            raise InputError(
-                f"--port {args.port}: expected a free port, found it in use or none; choose another"
-            ) from None
-    print(f"http://127.0.0.1:{args.port}/ (Ctrl-C ends it)", flush=True)
-    page.run(args.folder.resolve(), args.models, args.port, not args.no_browser)
+    if importlib.util.find_spec("nicegui") is None:
+        raise InputError("app: expected nicegui, found none; run: pip install 'drocap_ros[app]'")
+    if not 1 <= args.port <= 65535:
+        raise InputError(f"--port: expected 1 to 65535, got {args.port}; choose another")
+    from drocap_ros.app import page
+    from drocap_ros.app.serving import listen
+    from drocap_ros.view.motion_view import has_screen
+
+    with listen("127.0.0.1", args.port) as sock, stop_signals() as stop:
+        address = f"http://127.0.0.1:{args.port}/"
+        print(f"open {address} in a browser; Ctrl-C stops", flush=True)
+        if has_screen() and not args.no_browser:
+            webbrowser.open(address)
+        page.run(args.folder.resolve(), args.models, sock, stop)
     return 0

@@ -1,89 +1,34 @@
-"""Serves the station's page: who may open it, signs of life, pictures, start and end."""
+"""What the station serves: its page, pictures, signs of life and the stop."""
 
 from __future__ import annotations
 
-import logging
-import secrets
 import socket
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs
+from typing import TYPE_CHECKING
 
-from drocap_ros.errors import InputError
-from drocap_ros.export.stream_out_config import is_loopback
+from drocap_ros.app import serving
 from drocap_ros.station.page import Page
 from drocap_ros.station.station import Station
 
 if TYPE_CHECKING:
+    from fastapi import FastAPI
     from starlette.requests import Request
     from starlette.responses import Response
 
-#: Messages that a page misses while its connection is interrupted; beyond them it is loaded anew.
-_KEPT_MESSAGES = 50
-#: Time for open connections at the end, s.
-_CLOSING_S = 1
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """Socket of an address, or an InputError where it is taken or not ours."""
-    try:
-        family, kind, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        sock = socket.socket(family, kind)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(place)
-        sock.listen()
-    except OSError as error:
-        raise InputError(
-            f"--port: expected a free address, found {host}:{port} refused ({error.strerror}); choose another"
-        ) from None
-    return sock
-
-
-class Door:
-    """ASGI middleware: off the loopback a token is asked for once, then a cookie has it.
-
-    On the loopback the name of this computer is: a foreign page whose name leads here is refused.
-    """
-
-    def __init__(self, app: Any, token: str, port: int) -> None:
-        self._app, self._token, self._cookie = app, token, f"station_{port}"
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """As of ASGI."""
-        if scope["type"] not in ("http", "websocket"):
-            await self._app(scope, receive, send)
-            return
-        from starlette.requests import HTTPConnection
-        from starlette.responses import PlainTextResponse, RedirectResponse
-
-        asks = HTTPConnection(scope)
-        if self._is_known(asks):
-            await self._app(scope, receive, send)
-            return
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        if scope["type"] == "http" and self._token and secrets.compare_digest(given.encode(), self._token.encode()):
-            answer: Response = RedirectResponse(scope["path"], 303)
-            answer.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
-        else:
-            answer = PlainTextResponse("Open the address that `drocap station` has printed.\n", 403)
-        await answer(scope, receive, send)
-
-    def _is_known(self, asks: Any) -> bool:
-        if self._token:
-            return secrets.compare_digest(asks.cookies.get(self._cookie, "").encode(), self._token.encode())
-        return is_loopback(asks.url.hostname or "")
-
 
 def serve(station: Station, sock: socket.socket, token: str, stop: threading.Event) -> None:
-    """Serve the page until ``stop``, or a signal."""
-    import uvicorn
-    from fastapi import FastAPI
+    """Serve the page until ``stop``, a signal, or the end of the graph's thread."""
+
+    def build(app: FastAPI) -> None:
+        _add_routes(app, station)
+
+    serving.serve(build, sock, stop, token=token, failed=lambda: station.failure is not None)
+
+
+def _add_routes(app: FastAPI, station: Station) -> None:
     from nicegui import ui
     from starlette.responses import Response
-
-    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-    app.add_middleware(Door, token=token, port=sock.getsockname()[1])
 
     def route(path: str, method: str, act: Callable[[Request], Response]) -> None:
         async def answer(request: Request) -> Response:
@@ -114,23 +59,3 @@ def serve(station: Station, sock: socket.socket, token: str, stop: threading.Eve
     @ui.page("/", title="drocap station")
     def page() -> None:
         Page(station)
-
-    logging.getLogger("nicegui").setLevel(logging.ERROR)  # warnings of its own end are no user's business
-    ui.run_with(
-        app, dark=None, show_welcome_message=False, message_history_length=_KEPT_MESSAGES, binding_refresh_interval=None
-    )
-    server = uvicorn.Server(
-        uvicorn.Config(app, log_level="critical", access_log=False, timeout_graceful_shutdown=_CLOSING_S)
-    )
-    watch = threading.Thread(target=_end, args=(server, station, stop), daemon=True)
-    watch.start()
-    server.run([sock])
-    stop.set()
-    watch.join()
-
-
-def _end(server: Any, station: Station, stop: threading.Event) -> None:
-    """End the server with ``stop``, and with the graph's thread."""
-    while not stop.wait(0.2) and station.failure is None:
-        pass
-    server.should_exit = True

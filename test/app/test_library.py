@@ -116,5 +116,5 @@ def test_the_command_says_what_is_missing(tmp_path: Path, capsys: pytest.Capture
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         assert main(["app", str(tmp_path), "--no-browser", "--port", str(taken.getsockname()[1])]) == 2
-    assert "expected a free port" in capsys.readouterr().err
+    assert "expected a free address" in capsys.readouterr().err
     assert main(["app", str(tmp_path), "--no-browser", "--port", "70000"]) == 2

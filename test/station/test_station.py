@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from drocap_ros.app.serving import Door, listen
 from drocap_ros.bringup import bringup, free_domain, watch
 from drocap_ros.cli import main
 from drocap_ros.cli.graph.top import dashboard_of
@@ -19,7 +20,6 @@ from drocap_ros.ros.topics import TOPICS
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.station.desk import check_values
 from drocap_ros.station.drawing import bearing_deg, bearing_svg, body_points, keypoints_svg, plan_svg
-from drocap_ros.station.server import Door, listen
 from drocap_ros.station.station import SILENT_S, Station, Views
 
 

@@ -52,12 +52,13 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("station: expected nicegui, found none; run: pip install 'drocap_ros[app]'")
     config, domain_id = load_config(args.config), chosen_domain(args)
     bringup = import_bringup()
+    from drocap_ros.app.serving import listen
     from drocap_ros.cli.graph.preflight import setup_of
     from drocap_ros.cli.graph.running_bridge import BridgeListener
     from drocap_ros.cli.graph.top import dashboard_of
     from drocap_ros.export.stream_out_config import is_loopback
     from drocap_ros.flight.preflight.measure import all_findings
-    from drocap_ros.station.server import listen, serve
+    from drocap_ros.station.server import serve
     from drocap_ros.station.station import Station, Views
     from drocap_ros.view.motion_view import has_screen
 
