@@ -119,8 +119,10 @@ class Follower:
         self._images: deque[Frame] = deque(maxlen=_MOST_IMAGES)
 
     def follow(self, frame: Frame) -> PoseObservation | None:
-        """The subject in the next image; None where too little of it is known or found."""
+        """The subject in the next image; None where too little of it is found, or no network looks any more."""
         self._images.append(frame)
+        if self._flow.steps >= _MOST_IMAGES:
+            return None
         return self._flow.propagate(frame.image, frame.stamp_ns)
 
     def correct(self, seen: PoseObservation) -> None:
