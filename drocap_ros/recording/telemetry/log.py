@@ -161,7 +161,7 @@ def at_stamps(known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, *,
 #: Largest magnitudes of pitch, roll and yaw, deg.
 _LIMITS_DEG = np.array([180.0, 180.0, 360.0])
 #: Metres of a degree of latitude.
-_METRES_PER_DEG = 111_320.0
+METRES_PER_DEG = 111_320.0
 
 
 class Series(NamedTuple):
@@ -240,7 +240,7 @@ def _check_path(path: Path, stamp_ns: np.ndarray, place: np.ndarray) -> None:
         return
     step = np.diff(place[known], axis=0)
     step[:, 1] = (step[:, 1] + 180.0) % 360.0 - 180.0
-    scale = np.array([_METRES_PER_DEG, _METRES_PER_DEG * np.cos(np.deg2rad(place[known][0, 0])), 1.0])
+    scale = np.array([METRES_PER_DEG, METRES_PER_DEG * np.cos(np.deg2rad(place[known][0, 0])), 1.0])
     way = np.linalg.norm(step * scale, axis=1)
     # No drone flies farther: DJI's fastest have some 40 m/s, and a fix that is renewed moves a place by some metres.
     jumps = way > 20.0 + 60.0 * np.diff(stamp_ns[known]) * 1e-9
