@@ -69,6 +69,11 @@ class CameraErrors:
     acceleration_m_s2: float = 3.0
 
     @property
+    def latency_covariance(self) -> np.ndarray:
+        """(2, 2) s^2 of attitude and position: one log holds both, so they have most of it in common."""
+        return np.asarray(self.latency_s**2 * (0.2 * np.eye(2) + 0.8))
+
+    @property
     def wander_s(self) -> np.ndarray:
         """(6,) time constants of the slow errors of position and attitude."""
         return np.repeat([self.position_wander_s, self.attitude_wander_s], 3)

@@ -40,15 +40,6 @@ HEIGHT_STD_M = 0.1
 #: Likelihood of a foot that moves, against that of one that rests at the floor: while scale and camera are found, which
 #: false contacts bend, and when feet are locked in their places (docs/accuracy.md: 0.12 to 1 tried).
 MOVING, MOVING_LOCKED = 0.5, 0.12
-#: Images over which the speed of a foot is averaged: in single steps false contacts set the scale off by 6 %.
-_AVERAGE_IMAGES = 3
-#: Bounds of the lifter's probability: neither a foot in contact nor a moving one depends on it alone.
-_LEAST_SURE, _MOST_SURE = 0.01, 0.99
-#: Least standard deviation (m/s) of the speed at which two resting feet seem to part: the median of demo sessions,
-#: where one of them moves it is 0.3.
-_PARTING_STD_M_S = 0.07
-#: The same over the median speed where keypoints are noisier: most pairs that look at rest do rest.
-_PARTING_OF_MEDIAN = 0.7
 
 #: Time (s) over which the velocity of a foot of a finished motion is averaged, and least duration of its rest.
 SPAN_AVERAGE_S = 0.15
@@ -77,7 +68,8 @@ class RestingFeet:
         if looks is not None:
             steps = 0.5 * (looks[1:] + looks[:-1])
             self._said = np.where((steps == 0.0) | (steps == 1.0), steps, np.nan)
-            sure = np.clip(steps, _LEAST_SURE, _MOST_SURE)
+            # Bounds: neither a foot in contact nor a moving one depends on the lifter's probability alone.
+            sure = np.clip(steps, 0.01, 0.99)
             self._odds = np.tile(sure / (1.0 - sure), 2)
             if start is not None:
                 self._together = _resting_together(sure, parting_speed(start, fps))
@@ -171,11 +163,14 @@ def _resting_together(looks: np.ndarray, parting: np.ndarray) -> np.ndarray:
     at_rest = looks.min(axis=1) > 0.8
     if not at_rest.any():
         return np.ones(parting.shape)
-    std = np.maximum(_PARTING_STD_M_S, _PARTING_OF_MEDIAN * np.median(parting[at_rest], axis=0))
+    # At least the median of demo sessions, where a foot that moves parts at 0.3 m/s; where keypoints are noisier, most
+    # pairs that look at rest do rest.
+    std = np.maximum(0.07, 0.7 * np.median(parting[at_rest], axis=0))
     return np.where(at_rest[:, None], np.exp(-0.5 * np.square(parting / std)), 1.0)
 
 
 def _averaged(values: np.ndarray) -> np.ndarray:
     from scipy.ndimage import uniform_filter1d
 
-    return np.asarray(uniform_filter1d(values, min(_AVERAGE_IMAGES, max(len(values), 1)), axis=0, mode="nearest"))
+    # In single steps false contacts set the scale off by 6 %.
+    return np.asarray(uniform_filter1d(values, min(3, max(len(values), 1)), axis=0, mode="nearest"))

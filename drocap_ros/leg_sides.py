@@ -19,13 +19,6 @@ _RIGHT = np.array([BODY_15.index("rknee"), BODY_15.index("rankle")])
 _BELOW = ("knee", "ankle", "toe", "heel")
 _HIPS = np.array([BODY_15.index("lhip"), BODY_15.index("rhip")])
 
-#: Bound on the cost of one joint's step: a gross error carries no information about sides.
-_MOST_COST = 8.0
-#: Cost of the second hypothesis, per pair of joints and unit of -log(1 - confidence).
-_CONTRADICTION = 0.12
-#: Gap after which the positions of the legs carry no information.
-_LONGEST_GAP_S = 0.25
-
 
 def with_own_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.ndarray) -> Keypoints2D:
     """Keypoints with the legs exchanged back in the images in which the network most likely exchanged them.
@@ -42,7 +35,8 @@ def exchanged_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.nd
     xy, weights = keypoints.xy, keypoints.weights
     step = _step_costs(xy, stamp_ns, box_size)
     certain = np.minimum(weights[:, _LEFT], weights[:, _RIGHT])
-    prices = (-_CONTRADICTION * np.log1p(-np.clip(certain, 0.0, 0.999)).sum(axis=1)).tolist()
+    # Of the second hypothesis, per pair of joints and unit of -log(1 - confidence).
+    prices = (-0.12 * np.log1p(-np.clip(certain, 0.0, 0.999)).sum(axis=1)).tolist()
     right, wrong = 0.0, prices[0]
     origin = [(False, False)]  # per hypothesis: whether the image before has the other one
     for keep, change, price in zip(step[1:, 0].tolist(), step[1:, 1].tolist(), prices[1:], strict=True):
@@ -67,13 +61,15 @@ def _step_costs(xy: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> n
 
     def cost(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         squared = np.square((b[1:] - a[:-1]) / scale[..., None]).sum(axis=2)
-        costs = np.minimum(0.5 * squared, _MOST_COST)
+        # A gross error carries no information about sides.
+        costs = np.minimum(0.5 * squared, 8.0)
         costs[np.isnan(costs)] = 0.0
         return np.asarray(costs.sum(axis=1))
 
     out[1:, 0] = cost(left, left) + cost(right, right)
     out[1:, 1] = cost(left, right) + cost(right, left)
-    out[1:][np.diff(stamp_ns) > _LONGEST_GAP_S * 1e9] = 0.0
+    # After such a gap the positions of the legs carry no information.
+    out[1:][np.diff(stamp_ns) > 0.25 * 1e9] = 0.0
     return out
 
 

@@ -214,13 +214,9 @@ _NECK_SPREAD = 0.11
 _HEAD_SPREAD = 0.14  # likewise
 #: The same of the head about the line from neck to crown: 21 mm of 175.
 _CROWN_SPREAD = 0.12
-#: Factor on the confidence of an extrapolated joint: the lean of the head is not seen.
-_EXTRAPOLATED_CONFIDENCE = 0.85
 #: Distance of the shoulders' centres over that of the drawn ones, in the pictures of three phone videos with optical
 #: MoCap: 1.17, 1.19, 1.23, the camera fitted to the other joints.
 SHOULDERS_OUTWARDS = 1.2
-#: Standard deviation of that shift, share of it: people and views differ more than these videos.
-_SHIFT_SPREAD = 0.5
 
 _SIDES = (("l", "left_"), ("r", "right_"))
 _LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -317,7 +313,8 @@ class JointMap:
         # The errors of the parts are assumed independent.
         parts = np.where(moved, self.weights + self.outwards, self.weights)
         out_covariance = parts**2 @ np.nan_to_num(covariance)
-        out_covariance += _SHIFT_SPREAD**2 * shift[..., [0, 0, 1]] * shift[..., [0, 1, 1]]
+        # People and views differ more than these videos.
+        out_covariance += 0.5**2 * shift[..., [0, 0, 1]] * shift[..., [0, 1, 1]]
         # Least length of the line, share of the person's box: a view from above shortens it.
         length = np.maximum(np.linalg.norm(self.lines @ points, axis=-1), 0.05 * np.asarray(box_size)[..., None])
         extra = np.where(self.spread > 0, (self.spread * length) ** 2, 0.0)
@@ -332,7 +329,8 @@ class JointMap:
         points, _, shift = self._shifted(xy)
         out = np.where(known[..., None], self.weights @ points + shift, np.nan)
         lowest = np.where(used, np.nan_to_num(confidence)[..., None, :], np.inf).min(axis=-1)
-        out_confidence = np.where(self.spread > 0, _EXTRAPOLATED_CONFIDENCE, 1.0) * lowest
+        # The lean of the head is not seen.
+        out_confidence = np.where(self.spread > 0, 0.85, 1.0) * lowest
         return out, np.where(known, out_confidence, 0.0)
 
     def _shifted(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -230,8 +230,6 @@ _PRELOAD = (
     "scipy.ndimage",
     "cv2",
 )
-#: Longest wait for the scheduler, s; a judgement.
-_CONNECT_S = 20.0
 
 
 def run_on_this_machine(tasks: Sequence[Task], jobs: int) -> Generator[Record, None, None]:
@@ -284,7 +282,8 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Generator[Record, Non
         raise InputError(f"--cluster: expected dask.distributed, found none; run {install}") from None
     for again in (True, True, False):
         try:
-            client = Client(address, timeout=_CONNECT_S)  # type: ignore[no-untyped-call]
+            # Longest wait for the scheduler; a judgement.
+            client = Client(address, timeout=20.0)  # type: ignore[no-untyped-call]
             break
         except (OSError, ValueError, TimeoutError) as error:
             raise InputError(f"--cluster {address}: expected the address of a Dask scheduler; {error}") from None

@@ -6,9 +6,6 @@ import numpy as np
 
 from drocap_ros.reconstruction.together.timing import ShownMotion, time_offsets
 
-#: Least likeness, and largest of the second best over it, of an offset that is clear.
-_LEAST, _CLEAR = 0.5, 0.9
-
 
 def find_offset(
     estimate: np.ndarray, estimate_s: np.ndarray, truth: np.ndarray, truth_s: np.ndarray
@@ -24,6 +21,7 @@ def find_offset(
             return None
         shown.append(ShownMotion(joints[known], time_s[known], np.ones(known.sum(), bool)))
     found = time_offsets(shown[0], shown[1], level=False)
-    if not found or found[0].likeness < _LEAST or (len(found) > 1 and found[1].likeness > _CLEAR * found[0].likeness):
+    # Clear is an offset with half the likeness of equal motions whose second best has at most 0.9 of its own.
+    if not found or found[0].likeness < 0.5 or (len(found) > 1 and found[1].likeness > 0.9 * found[0].likeness):
         return None
     return round(found[0].seconds, 2), found[0].likeness  # as it is said

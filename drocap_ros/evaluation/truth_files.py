@@ -41,8 +41,6 @@ _UNITS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "m": 1.0, "meters": 1.0, 
 _UNITS["in/0.45"] = 0.0254 / 0.45
 #: Thigh and shank of people, m: of a child of four years, and of the tallest man.
 _LEG_M = (0.4, 1.3)
-#: Share of the line from ankles to shoulders along an axis, from which that is the vertical of the recording.
-_UPRIGHT = 0.8
 #: Turns of axes (x, y, z) to z up, by the vertical.
 _TO_Z_UP = {
     "X": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
@@ -173,7 +171,8 @@ def _vertical(x: np.ndarray, stated: str) -> str:
     line = np.median(shoulders - ankles, axis=0)
     share = line / max(float(np.linalg.norm(line)), 1e-12)
     axis = int(np.argmax(np.abs(share)))
-    if not abs(share[axis]) >= _UPRIGHT:
+    # The vertical of the recording is the axis that has 0.8 of the line from ankles to shoulders.
+    if not abs(share[axis]) >= 0.8:
         return stated
     return ("-" if share[axis] < 0 else "") + "XYZ"[axis]
 

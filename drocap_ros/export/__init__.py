@@ -49,11 +49,8 @@ def export(
     rest : rest pose of rigs, one of :data:`drocap_ros.export.rig.RESTS`; None: "t"
     smooth_hz : cut-off of :func:`drocap_ros.export.take.smooth`; None: no filter
     lock_feet : :func:`drocap_ros.export.take.lock_feet`, after the filter
-
-    Returns
-    -------
-    Notes on changes, as sentences: frames without the person, resampling, interpolation, cleaning, constant bones,
-    floor, unknown vertical.
+    returns : notes on changes, as sentences: frames without the person, resampling, interpolation, cleaning,
+        constant bones, floor, unknown vertical
     """
     from drocap_ros.export import take as preparation
     from drocap_ros.export.animation import write_bvh, write_glb

@@ -159,10 +159,6 @@ def interpolated(times_s: np.ndarray, positions: np.ndarray, known: np.ndarray) 
 _TWICE = (np.sqrt(2.0) - 1.0) ** 0.25
 #: Farther than this, m, from its median place a foot is not at rest.
 _FARTHEST_M = 0.08
-#: Change of a leg's half length per turn of its knee at which half of the turn is made; 0.07 is that of 8 degrees.
-_DAMPING = 0.07
-#: Distance of a knee from the line of its leg at which its direction counts as much as the moments around, m.
-_CLEAR_M = 0.02
 #: A root that moves less than this stands still: it has no place in the world, m.
 ROOT_MOVES_M = 0.05
 
@@ -273,7 +269,8 @@ def _two_bones(leg: np.ndarray, target: np.ndarray, rate_hz: float) -> tuple[np.
     turn = np.where(np.abs(turn) < 1e-6, 1e-6, turn)
     # Change of length per turn, of the leg's half length.
     effect = 2.0 * np.abs(reach_at(bend + turn) - before) / (np.abs(turn) * np.maximum(thigh + shank, 1e-9))
-    reach = reach_at(bend + turn * effect**2 / (effect**2 + _DAMPING**2))
+    # Half of the turn is made where a turn of the knee changes the leg's half length by 0.07: at 8 degrees.
+    reach = reach_at(bend + turn * effect**2 / (effect**2 + 0.07**2))
     along = (target - hip) / np.maximum(wanted, 1e-9)[:, None]
     foot = (thigh**2 - shank**2 + reach**2) / (2.0 * np.maximum(reach, 1e-9))
     height = np.sqrt(np.maximum(thigh**2 - foot**2, 0.0))
@@ -293,4 +290,5 @@ def _aside(knee: np.ndarray, ankle: np.ndarray, rate_hz: float) -> np.ndarray:
     own = knee - line * np.sum(knee * line, axis=1, keepdims=True)
     around = np.nan_to_num(own) * np.linalg.norm(np.nan_to_num(own), axis=1, keepdims=True)
     around = gaussian_filter1d(around, min(max(SPAN_AVERAGE_S * rate_hz, 1e-3), 1000.0), axis=0)
-    return np.asarray(own + _CLEAR_M * around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-12))
+    # 2 cm off the line of its leg a knee's direction counts as much as the moments around.
+    return np.asarray(own + 0.02 * around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-12))

@@ -165,8 +165,6 @@ PICTURE_CODES = frozenset(
 #: Factor of a limit that a command may reach: its values are float32, and limits are sums of decimal fractions.
 ROUNDING = 1.0 + 1e-6
 
-_NEVER_S = 1e8  # ages from here on, three years, are those of what never came
-
 
 @dataclass(frozen=True)
 class Condition:
@@ -180,7 +178,8 @@ class Condition:
 
     def __str__(self) -> str:
         age = self.values.get("age_s")
-        ago = f"{age:.1f} s ago" if isinstance(age, float) and age < _NEVER_S else "never"
+        # Older than three years is what never came.
+        ago = f"{age:.1f} s ago" if isinstance(age, float) and age < 1e8 else "never"
         return self.code.sentence.format(ago=ago, **self.values)
 
 

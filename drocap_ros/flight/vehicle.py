@@ -204,34 +204,13 @@ class PoseHistory:
         return None
 
 
-class _Errors(NamedTuple):
-    """How the reports err.
-
-    fades_s : in which the error of a reported velocity fades: recorded ones halve within 2 s
-    least_wander_m2_s : a reported position wanders by itself as a random walk, at least so: recorded of both autopilots
-    wander_averaged_s, wandered_s : in which its wander is averaged, and whose wander counts as its noise
-    least_m_s, greatest_m_s : bounds of the velocity's standard deviation: half the best recorded one, twice the worst
-    block_s, averaged_s : blocks whose mean errors are compared with the next one's, and in which this is averaged: a
-        position that wanders by itself errs otherwise from block to block; the error of a velocity lasts
-    longest_gap_s : that the velocity bridges
-    jump_m : from one reported position to the next, beyond what the velocity explains; recorded: 0.1 m at most
-    contradiction_m_s : lasting error that no healthy autopilot's velocity has; recorded: 0.9 m/s at most
-    """
-
-    fades_s: float = 2.5
-    least_wander_m2_s: float = 4e-4
-    wander_averaged_s: float = 5.0
-    wandered_s: float = 2.0
-    least_m_s: float = 0.01
-    greatest_m_s: float = 0.6
-    block_s: float = 0.5
-    averaged_s: float = 20.0
-    longest_gap_s: float = 0.5
-    jump_m: float = 0.5
-    contradiction_m_s: float = 1.5
-
-
-_ERRORS = _Errors()
+#: s, in which the error of a reported velocity fades: recorded ones halve within 2 s.
+_FADES_S = 2.5
+#: m^2/s: a reported position wanders by itself as a random walk, at least so: recorded of both autopilots.
+_LEAST_WANDER_M2_S = 4e-4
+_WANDERED_S = 2.0  # whose wander of the position counts as its noise
+_LONGEST_GAP_S = 0.5  # that the velocity bridges
+_JUMP_M = 0.5  # from one reported position to the next, beyond what the velocity explains; recorded: 0.1 m at most
 
 
 class Doubt(NamedTuple):
@@ -263,7 +242,7 @@ class VehicleFilter:
         self.velocity: np.ndarray = np.full(3, np.nan)
         self._error: np.ndarray = np.zeros(3)  # of the reported velocity
         self._covariance: np.ndarray = np.zeros((3, 2, 2))  # of position and error
-        self._wander: np.ndarray = np.full(3, _ERRORS.least_wander_m2_s)
+        self._wander: np.ndarray = np.full(3, _LEAST_WANDER_M2_S)
         self._block: tuple[float, np.ndarray] = (0.0, np.zeros(3))  # s, and m that the velocity does not explain
         self._before: np.ndarray | None = None  # (3,) m/s, mean of the block before
 
@@ -280,10 +259,10 @@ class VehicleFilter:
         """
         gap_s, jump_m = stamp_s - self._stamp_s, 0.0
         if math.isfinite(gap_s):
-            way = min(max(gap_s, 0.0), _ERRORS.longest_gap_s) * 0.5 * (self._reported[1] + velocity)
+            way = min(max(gap_s, 0.0), _LONGEST_GAP_S) * 0.5 * (self._reported[1] + velocity)
             step = position - self._reported[0] - way
             jump_m = math.sqrt(step @ step)
-        if 0.0 < gap_s <= _ERRORS.longest_gap_s and jump_m <= _ERRORS.jump_m:
+        if 0.0 < gap_s <= _LONGEST_GAP_S and jump_m <= _JUMP_M:
             self._predict(gap_s, 0.5 * (self._reported[1] + velocity))
             self._correct(gap_s, position)
             self._learn(gap_s, step)
@@ -293,19 +272,19 @@ class VehicleFilter:
         self.velocity = velocity - self._error
         error_m_s = math.sqrt(self._error @ self._error)
         return Doubt(
-            jump_m if jump_m > _ERRORS.jump_m else 0.0,
-            error_m_s if error_m_s > _ERRORS.contradiction_m_s else 0.0,
+            jump_m if jump_m > _JUMP_M else 0.0,
+            error_m_s if error_m_s > 1.5 else 0.0,  # no healthy autopilot's; recorded: 0.9 m/s at most
         )
 
     def _begin(self, position: np.ndarray) -> None:
         self._block, self._before = (0.0, np.zeros(3)), None
         self.position = position.copy()
         self._covariance = np.zeros((3, 2, 2))
-        self._covariance[:, 0, 0], self._covariance[:, 1, 1] = self._wander * _ERRORS.wandered_s, self._variance
+        self._covariance[:, 0, 0], self._covariance[:, 1, 1] = self._wander * _WANDERED_S, self._variance
 
     def _predict(self, gap_s: float, velocity: np.ndarray) -> None:
         """Move on by a mean reported velocity; its error fades and is renewed."""
-        fade = math.exp(-gap_s / _ERRORS.fades_s)
+        fade = math.exp(-gap_s / _FADES_S)
         self.position = self.position + gap_s * (velocity - self._error)
         self._error = fade * self._error
         step = np.array([[1.0, -gap_s], [0.0, fade]])
@@ -315,7 +294,7 @@ class VehicleFilter:
     def _correct(self, gap_s: float, position: np.ndarray) -> None:
         """Move towards a reported position."""
         # Reports that follow each other sooner hold less news each.
-        noise = self._wander * _ERRORS.wandered_s**2 / gap_s
+        noise = self._wander * _WANDERED_S**2 / gap_s
         gain = self._covariance[:, :, 0] / (self._covariance[:, 0, 0] + noise)[:, None]
         innovation = position - self.position
         self.position = self.position + gain[:, 0] * innovation
@@ -326,16 +305,19 @@ class VehicleFilter:
         """Sizes of the velocity's error and of the position's wander, from a step (3,) m that neither explains."""
         wander = step**2 / gap_s - self._variance * gap_s
         self._wander = np.maximum(
-            self._wander + (wander - self._wander) * (1.0 - math.exp(-gap_s / _ERRORS.wander_averaged_s)),
-            _ERRORS.least_wander_m2_s,
+            self._wander + (wander - self._wander) * (1.0 - math.exp(-gap_s / 5.0)),
+            _LEAST_WANDER_M2_S,
         )
+        # The mean error of a block is compared with the next one's: a position that wanders by itself errs otherwise
+        # from block to block; the error of a velocity lasts.
         seconds, way = self._block[0] + gap_s, self._block[1] + step
         self._block = (seconds, way)
-        if seconds < _ERRORS.block_s:
+        if seconds < 0.5:
             return
         mean, before = way / seconds, self._before
         self._block, self._before = (0.0, np.zeros(3)), mean
         if before is not None:
-            found = mean * before * math.exp(seconds / _ERRORS.fades_s)
-            variance = self._variance + (found - self._variance) * (1.0 - math.exp(-seconds / _ERRORS.averaged_s))
-            self._variance = np.clip(variance, _ERRORS.least_m_s**2, _ERRORS.greatest_m_s**2)
+            found = mean * before * math.exp(seconds / _FADES_S)
+            variance = self._variance + (found - self._variance) * (1.0 - math.exp(-seconds / 20.0))
+            # Half the best recorded standard deviation, twice the worst.
+            self._variance = np.clip(variance, 0.01**2, 0.6**2)

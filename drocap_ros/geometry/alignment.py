@@ -35,11 +35,8 @@ def similarity(
 
     source, target : (..., P, 3)
     with_scale : False for a rigid motion
-
-    Returns
-    -------
-    scale (...), rotation (..., 3, 3), translation (..., 3)
-        ``target ~ scale * source @ rotation^T + translation``.  A source of one point has scale 1.
+    returns : scale (...), rotation (..., 3, 3), translation (..., 3), of
+        ``target ~ scale * source @ rotation^T + translation``; a source of one point has scale 1
     """
     # An array, not a number: the products, and the order of the sums over them, then do not depend on the layout of
     # the points in memory.
@@ -68,11 +65,8 @@ def torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:
     """Body-fixed frame of each pose: x forward, y left, z up along the trunk.
 
     s : (..., P, 3), any right-handed frame and unit
-
-    Returns
-    -------
-    (..., 3, 3) rotation; its columns are the axes of the body, so ``s @ torso_frame(s)`` is the pose in them.
-        The trunk's axis is pelvis to neck; left is right-to-left over hips and shoulders.
+    returns : (..., 3, 3) rotation; its columns are the axes of the body, so ``s @ torso_frame(s)`` is the pose in
+        them; the trunk's axis is pelvis to neck, left is right-to-left over hips and shoulders
     """
     at = {name: s[..., joints.index(name), :] for name in ("neck", "pelvis", "lhip", "rhip", "lshoulder", "rshoulder")}
     z = unit_or(at["neck"] - at["pelvis"], np.array([0.0, 0.0, 1.0]))
@@ -100,11 +94,7 @@ def to_torso_frame(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split poses into body-fixed shapes and the rotation of the body.
 
     s : (..., P, 3) of BODY_15, for example in the camera's frame
-
-    Returns
-    -------
-    shape (..., P, 3), rotation (..., 3, 3)
-        ``s == shape @ rotation^T``.
+    returns : shape (..., P, 3), rotation (..., 3, 3), of ``s == shape @ rotation^T``
     """
     rotation = torso_frame(s)
     return s @ rotation, rotation

@@ -106,16 +106,6 @@ def peak(values: np.ndarray, best: int) -> float:
     return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0
 
 
-#: Smoothing of the path through the steps.
-_SMOOTHING_S = 0.25
-#: Steps in the median: rounded coordinates of 1e-7 deg have 11 mm.
-_STEP_M = 0.005
-#: Two steps that differ by more are a jump of the log, which stays as it is.
-_JUMP_M = 1.0
-#: Share of the times between reports that are alike where positions are held until the next report.
-_ALIKE = 0.8
-
-
 def without_steps(position: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
     """Positions (F, 3) m at increasing stamps without the steps of rounded coordinates, or of held reports.
 
@@ -130,8 +120,9 @@ def without_steps(position: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     for axis in range(position.shape[1]):
         at, step = np.flatnonzero(moves[:, axis]), change[moves[:, axis], axis]
-        # Fewer steps are no pattern.
-        if len(at) < 4 or np.median(np.abs(step)) < _STEP_M or np.abs(np.diff(step)).max() > _JUMP_M:
+        # Fewer steps are no pattern.  Rounded coordinates of 1e-7 deg have 11 mm; two steps that differ by more than
+        # 1 m are a jump of the log.
+        if len(at) < 4 or np.median(np.abs(step)) < 0.005 or np.abs(np.diff(step)).max() > 1.0:
             continue
         rests = np.pad(~moves[:, axis], 1)
         # Least share of the steps that stand alone between frames at rest; a flown path has hardly any.
@@ -140,7 +131,8 @@ def without_steps(position: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
         late_s = _late_s(moves, time)
         passed = 0.5 * (time[at] + time[at + 1]) - late_s
         path = _through(time, passed, position[at, axis] + 0.5 * step, 1.0 if late_s else 0.5)
-        smoothing = min(_SMOOTHING_S / float(np.median(np.diff(time))), len(time))
+        # The path through the steps is smoothed over 0.25 s.
+        smoothing = min(0.25 / float(np.median(np.diff(time))), len(time))
         out[:, axis] = smoothed(path[:, None], smoothing)[:, 0]
     return out
 
@@ -150,7 +142,8 @@ def _late_s(moves: np.ndarray, time: np.ndarray) -> float:
     at = np.flatnonzero(moves.any(axis=1))
     gaps = np.diff(at)
     usual = float(np.median(gaps))
-    held = usual >= 2 and (np.abs(gaps - usual) <= 1).mean() > _ALIKE
+    # Held positions have reports at times that are alike.
+    held = usual >= 2 and (np.abs(gaps - usual) <= 1).mean() > 0.8
     return 0.5 * float(np.median(np.diff(time[at]))) if held else 0.0
 
 

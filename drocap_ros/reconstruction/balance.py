@@ -28,20 +28,9 @@ for _from, _to, _mass, _way in _SEGMENTS:
     _MASS[indices(BODY_15.joints, (_from, _to))] += [_mass * (1.0 - _way), _mass * _way]
 _THIGHS = tuple(indices(BODY_15.joints, pair) for pair in (("rknee", "rhip"), ("lknee", "lhip")))
 _TRUNK = indices(BODY_15.joints, ("pelvis", "neck"))
-#: Standard deviation (rad) of the direction from the feet to the centre of mass, from the vertical, in the mean of 10 s
-#: of somebody who is on his feet: MoCap of mocap/train and mocap/dev.
-_BALANCE_STD = 0.057
-#: Cosine with the vertical of trunk and of one thigh from which somebody is on his feet: who sits, lies or bends is
-#: not.
-_ON_FEET = 0.7
-#: Lean (rad) at which a frame has a quarter of its weight.
-_LEANS = 0.25
-#: Least time (s) and share of the frames on the feet.
-_LEAST_S, _LEAST_SHARE = 5.0, 0.5
 #: Cosine of the view with the vertical above which depth is no lean, and the largest shear.
 _STEEP = 0.95
 _LARGEST = 1.0
-_STEPS = 10
 
 
 def balanced(poses: ImagePoses, rotation: np.ndarray, stamp_ns: np.ndarray) -> ImagePoses:
@@ -58,23 +47,26 @@ def balanced(poses: ImagePoses, rotation: np.ndarray, stamp_ns: np.ndarray) -> I
     arm = np.einsum("p,fpc->fc", _MASS / _MASS.sum(), body) - body[:, ANKLES].mean(axis=1)
     with np.errstate(invalid="ignore"):
         thigh = np.maximum(*(_rise(body, pair, up) for pair in _THIGHS))
-        stands = (np.minimum(thigh, _rise(body, _TRUNK, up)) > _ON_FEET) & (np.abs(up[:, 2]) < _STEEP)
+        # Trunk and one thigh rise by 0.7 of their length: who sits, lies or bends is not on his feet.
+        stands = (np.minimum(thigh, _rise(body, _TRUNK, up)) > 0.7) & (np.abs(up[:, 2]) < _STEEP)
     seconds = stands.mean() * (stamp_ns[-1] - stamp_ns[0]) * 1e-9
-    if stands.mean() < _LEAST_SHARE or seconds < _LEAST_S:
+    if stands.mean() < 0.5 or seconds < 5.0:  # too little on the feet to tell a lean
         return poses
     arm, up = arm[stands], up[stands]
     level = np.array([0.0, 0.0, 1.0]) - up * up[:, 2:]
     level /= np.linalg.norm(level, axis=1, keepdims=True)
     shear, leans = 0.0, list[float]()
-    for _ in range(_STEPS):
+    for _ in range(10):
         leaning = arm + np.outer(arm[:, 1], [0.0, 0.0, shear])
         ahead, high = (leaning * level).sum(axis=1), np.maximum((leaning * up).sum(axis=1), 1e-9)
         lean, slope = ahead / high, arm[:, 1] * (level[:, 2] * high - up[:, 2] * ahead) / high**2
-        weight = 1.0 / (1.0 + np.square(lean / _LEANS)) ** 2
+        # A lean of 0.25 rad has a quarter of the weight.
+        weight = 1.0 / (1.0 + np.square(lean / 0.25)) ** 2
         leans.append(float(weight @ lean / weight.sum()))
         shear = float(np.clip(shear - (weight * slope) @ lean / max(weight @ slope**2, 1e-9), -_LARGEST, _LARGEST))
-    # What exceeds the leans of people is the poses' own (the estimate of James and Stein).
-    share = max(1.0 - _BALANCE_STD**2 / max(leans[0] ** 2, 1e-9), 0.0)
+    # What exceeds the leans of people is the poses' own (the estimate of James and Stein): in the mean of 10 s on the
+    # feet the centre of mass is 0.057 rad off the vertical, by MoCap of mocap/train and mocap/dev.
+    share = max(1.0 - 0.057**2 / max(leans[0] ** 2, 1e-9), 0.0)
     joints = poses.joints_px.copy()
     joints[..., 2] += share * shear * shape[..., 1]
     origin = poses.report.origin | {"lean_taken_off_deg": round(float(np.degrees(share * leans[0])), 1) + 0.0}

@@ -39,10 +39,7 @@ _LATEST_S = 2**63 // 10**9  # s: ns must fit into 64 bits with a sign
 def foxglove_message(data: bytes, encoding: str, type_name: str) -> SimpleNamespace:
     """One message.
 
-    Raises
-    ------
-    Exception
-        Of any kind, when it is of another encoding or type, or damaged.
+    raises Exception : of any kind, when it is of another encoding or type, or damaged
     """
     numbers = _FIELDS[type_name]
     if encoding == "json":

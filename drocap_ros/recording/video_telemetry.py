@@ -213,8 +213,6 @@ def correlate_turning(
 
     None where no offset is clearly better than all others; the log must cover the video.
 
-    Parameters
-    ----------
     times, motion : (N,) of :func:`image_motion`
     near_s : only offsets within ``CREATION_SLACK_S`` of this one
     """

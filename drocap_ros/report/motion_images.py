@@ -33,8 +33,6 @@ Box: TypeAlias = tuple[int, int, int, int]
 _ROOM, _LEAST_SIDE = 1.6, 96.0
 #: Least margin about the keypoints, as a share of their box.
 _EDGE = 0.1
-#: Time constant, s, of the square: it moves and grows evenly.
-_LAG_S = 0.5
 
 
 class FollowingBox:
@@ -62,7 +60,8 @@ class FollowingBox:
         seen = np.append(0.5 * (low + high), max(_ROOM * extent, _LEAST_SIDE))
         square = seen
         if self._square is not None:
-            square = seen + np.exp((self._stamp_ns - stamp_ns) * 1e-9 / _LAG_S) * (self._square - seen)
+            # The square moves and grows evenly, in half a second.
+            square = seen + np.exp((self._stamp_ns - stamp_ns) * 1e-9 / 0.5) * (self._square - seen)
         square[2] = max(square[2], (1 + 2 * _EDGE) * extent)
         reach = 0.5 * square[2] - _EDGE * extent
         square[:2] = np.clip(square[:2], high - reach, low + reach)
@@ -72,8 +71,6 @@ class FollowingBox:
 #: Most images in a report, and bytes of all together, as base64: the page stays quick to open and to mail.
 MAX_IMAGES = 300
 MAX_BYTES = 8_000_000  # bytes; mail often ends at 10 MB
-#: Longer side of an image in the page, px: the subject takes most of it.
-_LONG_SIDE = 480
 #: How an image is compressed, the best first: at a share of that size and a quality.
 _STEPS = tuple((share, quality) for share in (1, 2, 4) for quality in (75, 60, 45, 30))
 #: Growth of the bytes by a step up, of three videos at least 1.13, until a video has shown its own: a step that cannot
@@ -372,6 +369,7 @@ def _compressed(image: np.ndarray, step: int) -> bytes:
     import cv2
 
     share, quality = _STEPS[step]
-    scale = min(1.0, _LONG_SIDE / max(image.shape)) / share
+    # The longer side has 480 px in the page: the subject takes most of it.
+    scale = min(1.0, 480 / max(image.shape)) / share
     small = shrink(image, (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))))
     return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -19,16 +19,11 @@ from drocap_ros.skeleton import side_of
 _HEIGHT = 720
 #: The 3D pane is drawn in this size and shrunk: smooth edges.
 _FINE = 2
-#: Most images/s of the video, and s of a picture that stands where the motion has a gap.
-_MOST_HZ = 60.0
-_LONGEST_STILL_S = 1.0
 #: As in the report's light theme, BGR.
 _GROUND, _GRID, _TEXT = (248, 246, 244), (226, 218, 211), (117, 103, 92)
 _COLOURS = {"right": (47, 67, 200), "left": (176, 111, 42), "middle": (112, 100, 90)}
 #: Distance of the viewer, half the view's height, radius and step of the grid, floor below the ankles, head: m.
 _DISTANCE, _REACH, _GRID_REACH, _GRID_STEP, _FOOT, _HEAD = 6.0, 1.12, 1.4, 0.5, 0.06, 0.1
-#: Direction of view: rad from the front of the first pose, rad above the horizon.
-_BESIDE, _ABOVE = 0.75, 0.2
 #: Widths of limbs, m.
 _WIDTHS = {"hip": 0.05, "knee": 0.075, "ankle": 0.055, "neck": 0.055, "shoulder": 0.05, "elbow": 0.05}
 _TRUNK = ("lshoulder", "rshoulder", "rhip", "lhip")
@@ -56,8 +51,8 @@ def _pictures(motion: Motion, video: Path, progress: Progress) -> Iterator[tuple
     """Pictures (720, W, 3) uint8 BGR at an even rate, each with that rate in images/s."""
     s = motion_statistics(motion)
     body, follow = BodyPicture(motion, s), FollowingBox()
-    rate_hz = min(s.rate_hz or 1.0, _MOST_HZ)
-    longest = int(_LONGEST_STILL_S * rate_hz)
+    rate_hz = min(s.rate_hz or 1.0, 60.0)
+    longest = int(rate_hz)  # where the motion has a gap a picture stands for a second at most
     count = 0
     picture: np.ndarray | None = None
     for index, image in each_image(video, motion):
@@ -109,7 +104,8 @@ class BodyPicture:
     def __init__(self, motion: Motion, s: Statistics) -> None:
         self._motion, self._times = motion, s.times_s
         self._joints = upright_joints(motion)
-        azimuth, elevation = float(s.heading_rad[0]) + _BESIDE, _ABOVE
+        # rad from the front of the first pose, and above the horizon.
+        azimuth, elevation = float(s.heading_rad[0]) + 0.75, 0.2
         cos, sin = np.cos([azimuth, elevation]), np.sin([azimuth, elevation])
         towards = np.array([cos[1] * cos[0], cos[1] * sin[0], sin[1]])
         right = np.array([-sin[0], cos[0], 0.0])

@@ -16,8 +16,6 @@ from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
 
 #: Directions of view and of the body, and places without a world, are averaged over this time, s.
 SMOOTH_S = 0.5
-#: Height of the neck above the ankles over their distance, from which a body is upright: one who lies leans anyhow.
-_UPRIGHT = 0.7
 _TORSO = ("pelvis", "neck", "lhip", "rhip", "lshoulder", "rshoulder")
 
 
@@ -192,7 +190,8 @@ def _lean(motion: Motion) -> float:
     neck, left, right = (motion.joints3d[:, i] for i in indices(motion.joints, ends))
     body, bearing = neck - 0.5 * (left + right), motion.camera_rotation[:, 2, :2]
     length, flat = np.linalg.norm(body, axis=1), np.linalg.norm(bearing, axis=1)
-    upright = (body[:, 2] > _UPRIGHT * length) & (length > 0) & (flat > 0)
+    # A body is upright whose neck is 0.7 of its length above the ankles: one who lies leans anyhow.
+    upright = (body[:, 2] > 0.7 * length) & (length > 0) & (flat > 0)
     if upright.sum() <= 0.5 * np.isfinite(length).sum():
         return float("nan")
     lean, away = body[upright, :2] / length[upright, None], bearing[upright] / flat[upright, None]

@@ -122,10 +122,7 @@ def simulate_person(
     seed : of the person's proportions and of the take
     stature_m : height of the person
     joint_set : ``BODY_15`` or ``BODY_17``
-
-    Returns
-    -------
-    (F, P, 3) m, order of ``joint_set``, world ENU.
+    returns : (F, P, 3) m, order of ``joint_set``, world ENU
     """
     if action not in ACTIONS:
         raise InputError(f"action: expected one of {', '.join(ACTIONS)}, got {action!r}")

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 
-#: Start of the web server at most, s; a judgement.
-_START_S = 20.0
 INSTALL = "pip install 'rerun-sdk>=0.39,<0.40'"
 
 
@@ -125,7 +123,8 @@ def _check_free(host: str, *ports: int) -> None:
 
 
 def _wait_for(server: subprocess.Popen[bytes], host: str, port: int) -> None:
-    end = time.monotonic() + _START_S
+    # Start of the web server at most; a judgement.
+    end = time.monotonic() + 20.0
     while server.poll() is None and time.monotonic() < end:
         with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=1.0):
             return
@@ -192,9 +191,7 @@ SUBJECT = "world/subject"
 #: Groups of curves, one view each.
 PLOTS = ("reprojection_px", "confidence")
 
-_OPACITY = 200
 _WIDTH_M = 0.012
-_BACKGROUND = (238, 240, 243)
 
 
 class Scene:
@@ -219,7 +216,7 @@ class Scene:
         """Joints (P, 3) m and bones."""
         rr = self._rr
         known = np.isfinite(joints).all(1)
-        colours = _joint_colours(joints_of, _OPACITY)
+        colours = _joint_colours(joints_of, 200)
         names = [name for name, k in zip(joints_of.joints, known, strict=True) if k]
         self._log(
             f"{SUBJECT}/joints",
@@ -288,7 +285,7 @@ def layout() -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                rrb.Spatial3DView(origin=WORLD, name="3D", background=rrb.Background(color=_BACKGROUND)),
+                rrb.Spatial3DView(origin=WORLD, name="3D", background=rrb.Background(color=(238, 240, 243))),
                 rrb.Spatial2DView(origin=IMAGE, name="image"),
                 column_shares=[3, 2],
             ),
@@ -299,10 +296,6 @@ def layout() -> rrb.Blueprint:
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
-
-
-#: Images are shrunk to this: a minute of video then gives a file of about 150 MB.
-_LONG_SIDE = 960
 
 
 def draw_motion(
@@ -319,7 +312,8 @@ def draw_motion(
     size, zoom = _image_size(motion), 1.0
     for index, image in images:
         size = (image.shape[1], image.shape[0])
-        zoom = min(1.0, _LONG_SIDE / max(size))
+        # A minute of video then gives a file of about 150 MB.
+        zoom = min(1.0, 960 / max(size))
         scene.at(int(motion.stamp_ns[index]))
         scene.image(_shrunk(image, zoom))
         progress("images", (index + 1) / len(motion.stamp_ns))

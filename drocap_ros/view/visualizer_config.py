@@ -6,9 +6,6 @@ from dataclasses import dataclass
 
 from drocap_ros.parameters import Parameters, param
 
-#: Share of a period by which a stamp may be early: images at 30 Hz limited to 10 Hz are every third in spite of jitter.
-_EARLY = 0.9
-
 
 @dataclass(frozen=True)
 class VisualizerConfig(Parameters):
@@ -34,7 +31,8 @@ class RateLimit:
     """Thins a stream to a rate; a jump back in time restarts it.  Rate 0 keeps all messages."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._least_ns = round(_EARLY * 1e9 / rate_hz) if rate_hz > 0 else 0
+        # Stamps may be early by a tenth: images at 30 Hz limited to 10 Hz are every third in spite of jitter.
+        self._least_ns = round(0.9 * 1e9 / rate_hz) if rate_hz > 0 else 0
         self._last_ns: int | None = None
 
     def due(self, stamp_ns: int) -> bool:

@@ -46,12 +46,8 @@ def fly_in_simulated_time(
 
     Returns a sentence about the machine.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        Soon after ``interrupted`` is set.
-    DrocapError
-        When a node refuses its parameters or fails, or the flight takes far longer than it can.
+    raises KeyboardInterrupt : soon after ``interrupted`` is set
+    raises DrocapError : when a node refuses its parameters or fails, or the flight takes far longer than it can
     """
     begin_s = time.monotonic()
     down, up = (Channel(lambda: graph.now_s, config.flight_simulator.seed + i) for i in (1, 2))
@@ -91,10 +87,7 @@ def fly_in_real_time(
 def check_flown(operator: Operator) -> None:
     """Refuse a flight with less than half of the wanted orbit.
 
-    Raises
-    ------
-    NodeError
-        With the reason.
+    raises NodeError : with the reason
     """
     if operator.orbited_s < 0.5 * operator.seconds:
         why = operator.failure or "; ".join(operator.holds) or "no hold was reported"

@@ -48,14 +48,6 @@ class Decay(NamedTuple):
     most_m_s2: float
 
 
-class StickOverride(NamedTuple):
-    """Parameter whose bit lets the sticks end the control mode, and its value as shipped."""
-
-    setting: str
-    bit: int
-    shipped: int
-
-
 @dataclass(frozen=True)
 class ReportErrors:
     """Errors (position in m, velocity in m/s) of the autopilot's estimate along one axis, as a process.
@@ -85,7 +77,7 @@ class Simulated:
     jerk_m_s3 : of these
     lost_modes : mode entered when setpoints cease, by the loss action's number; empty = the time-out ends the motion
     loss_check_s : least and greatest delay of that
-    override : whether the sticks end the control mode; None = never
+    override : a parameter, its bit that lets the sticks end the control mode, and its value as shipped; None = never
     streams : messages that are sent unrequested, with their periods in s
     transit_s : from the bridge's process to the controller
     horizontal, vertical : errors of its estimate; the vehicle flies by it
@@ -106,7 +98,7 @@ class Simulated:
     vertical: ReportErrors
     lost_modes: Mapping[int, str] = field(default_factory=dict)
     loss_check_s: tuple[float, float] = (0.0, 0.0)
-    override: StickOverride | None = None
+    override: tuple[str, int, int] | None = None
     streams: Mapping[str, float] = field(default_factory=dict)
     transit_s: float = 0.0
     clock_rate: float = 1.0

@@ -19,7 +19,6 @@ from drocap_ros.flight.autopilot.autopilot import (
     ReportErrors,
     SettingCheck,
     Simulated,
-    StickOverride,
     warn_if,
 )
 from drocap_ros.flight.autopilot.coasting import HeldCoasting
@@ -163,7 +162,7 @@ PX4 = Autopilot(
         ),
         lost_modes={0: "POSCTL", 1: "ALTCTL", 3: "RTL", 4: "LAND", 5: "LOITER"},
         loss_check_s=(0.06, 0.13),  # measured
-        override=StickOverride("COM_RC_OVERRIDE", 2, 1),
+        override=("COM_RC_OVERRIDE", 2, 1),
         streams={"ATTITUDE": 0.05, "SYS_STATUS": 1.0},
         transit_s=0.07,
         clock_rate=0.994,  # recorded: slower than the bridge's by 0.6 %, by up to 3 % where the machine was busy

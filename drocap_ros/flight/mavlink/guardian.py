@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 #: vehicle stands by then: it brakes at 1.3 m/s^2 and more, from 2.3 m/s at most (``max_coast_m``).
 PACKETS, PERIOD_S = 8, 0.2
 _CHECK_S = 0.02  # as the watchdog's
-_MOST_READ, _MAX_DATAGRAM = 100, 65535  # of what has arrived in a step, and bytes each: a flood delays no packet
 _ENDS_S = PACKETS * PERIOD_S + 0.5  # until it has ended, one that holds too
 #: What ends a group of processes, as a service manager does with those that a dead bridge leaves: it ends by itself.
 _IGNORED = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -165,10 +164,11 @@ class _Port:
     def read(self) -> Iterator[bytes]:
         """What has arrived, once nobody else reads it."""
         with contextlib.suppress(OSError):
-            for _ in range(_MOST_READ):
+            # At most so many datagrams in a step: a flood delays no packet.
+            for _ in range(100):
                 if self._descriptor is None or not select.select([self._descriptor], [], [], 0.0)[0]:
                     return
-                yield os.read(self._descriptor, _MAX_DATAGRAM)
+                yield os.read(self._descriptor, 65535)
 
 
 def has_left(data: bytes, control: Sequence[int]) -> bool:

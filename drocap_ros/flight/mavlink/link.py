@@ -132,10 +132,7 @@ class MavlinkLink:
     def check_motion(self, message: Message) -> Message:
         """The message itself, if it is on the allow-list; for the watchdog.
 
-        Raises
-        ------
-        AssertionError
-            As :meth:`send_motion`.
+        raises AssertionError : as :meth:`send_motion`
         """
         if not self.config.commands_enabled or not is_motion(message):
             raise AssertionError(f"this link sends no {message.get_type()}")

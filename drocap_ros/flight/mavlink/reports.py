@@ -18,7 +18,6 @@ from drocap_ros.stamps import NS
 
 _EARTH, _NOSE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 _STALE_S = {"gimbal": 3.0, "servo": 0.5}  # without angles; those of servos follow the body's lean
-_STEP_S = 0.25  # between two reports, beyond which a rotation is not extrapolated
 
 
 class Mount:
@@ -90,7 +89,8 @@ class Mount:
         angles = latest.quaternion
         if before is not None and before.from_north == latest.from_north:
             step_ns = latest.received_ns - before.received_ns
-            if 0 < step_ns <= _STEP_S * NS:
+            # Between reports that are farther apart a rotation is not extrapolated.
+            if 0 < step_ns <= 0.25 * NS:
                 # A servo follows its demanded angle this much later: a frame of its signal, and its turning.
                 delay_s = 0.05 if self.kind == "servo" else 0.0
                 after_ns = received_ns - int(delay_s * NS) - latest.received_ns

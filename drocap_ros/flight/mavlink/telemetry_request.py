@@ -17,10 +17,6 @@ from drocap_ros.flight.mavlink.commands import Message
 from drocap_ros.flight.mavlink.parser import CurrentMode
 from drocap_ros.stamps import NS
 
-_RETRY_S = 0.7  # between requests for a parameter: two round trips of a slow radio
-_TRIES = 10  # then the autopilot lacks the parameter, or the link its answers
-_AGAIN_S = 10.0  # between requests for a known one, which the ground station may change
-
 
 @dataclass
 class _Setting:
@@ -53,8 +49,10 @@ class AutopilotSettings:
         """Parameters to request now: often until they are reported or the tries are used up, then every 10 s."""
         names = []
         for name, setting in self._settings.items():
-            patient = setting.tries >= _TRIES or not math.isnan(setting.value)
-            if abs(now_s - setting.requested_s) >= (_AGAIN_S if patient else _RETRY_S):
+            # After ten tries the autopilot lacks the parameter, or the link its answers.
+            patient = setting.tries >= 10 or not math.isnan(setting.value)
+            # 0.7 s are two round trips of a slow radio; a known one may be changed by the ground station.
+            if abs(now_s - setting.requested_s) >= (10.0 if patient else 0.7):
                 setting.requested_s, setting.tries = now_s, setting.tries + 1
                 names.append(name)
         return names
@@ -90,9 +88,6 @@ class AutopilotSettings:
 
 CURRENT_MODE_HZ = 2.0  # while nothing changes: measured
 _GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
-#: Requests for the attitude of a mount that has never sent it, after which there is none.
-_MOUNT_REQUESTS = 10  # without an answer: 20 s at the usual retries
-_MOUNT_REFUSALS = 2  # that were refused
 
 logger = logging.getLogger(__name__)
 
@@ -252,5 +247,6 @@ class TelemetryRequests:
 
     def _no_mount(self, number: int) -> bool:
         wanted = self._wanted[number]
-        enough = _MOUNT_REQUESTS if wanted.result in (None, mavlink.MAV_RESULT_ACCEPTED) else _MOUNT_REFUSALS
+        # Without an answer for 20 s at the usual retries, or refused twice, there is none.
+        enough = 10 if wanted.result in (None, mavlink.MAV_RESULT_ACCEPTED) else 2
         return number == _GIMBAL and wanted.request_count >= enough and not wanted.ever

@@ -27,7 +27,6 @@ _ECHOED_S = 0.25  # two periods of the echo, and a step: beyond its age and two 
 #: Window in s, least commanded speed in m/s, and share of the commanded speed below which the vehicle stands for all
 #: of the window.  In every recorded flight of the orbit it reached 0.46, and along the command, with the way, 0.27.
 _BY_SPEED, _BY_WAY = (1.0, 0.6, 0.25), (2.0, 0.6, 0.15)
-_MOST_WAY_M = 1.0  # a walking subject in wind keeps the vehicle at a distance from its place, and it flies
 
 
 class Echoes(NamedTuple):
@@ -91,7 +90,8 @@ class Following:
         along_m_s = float(np.hypot(*commanded))
         # Before a vehicle that stands the reference waits: its speed falls, and the way to its place remains.
         way = np.array([setpoint.y, setpoint.x], dtype=float) - vehicle.position_enu_m[:2]
-        commanded += gain_per_s * min(1.0, _MOST_WAY_M / max(float(np.hypot(*way)), 1e-6)) * way
+        # A walking subject in wind keeps the vehicle at a distance from its place, and it flies.
+        commanded += gain_per_s * min(1.0, 1.0 / max(float(np.hypot(*way)), 1e-6)) * way
         speed_m_s = float(np.hypot(*commanded))
         # A vehicle stands where the way to its place and the velocity there cancel, as after an adjustment.
         stands = self._by_speed.judge(now_s, min(along_m_s, speed_m_s), float(np.hypot(*flown)))

@@ -22,22 +22,8 @@ from drocap_ros.flight.orbit.states import (
     Sight,
 )
 
-_AT_REST_M_S = 0.35  # below it a vehicle stands, by a velocity that errs by as much
-_SETTLED_S = 0.3  # slow for so long: a vehicle that springs back is slow for a moment where it turns
 _LEAST_S = 0.5  # of a hold before its mode is requested, and of reports without a jump before their place is latched
-_DEAD_RECKONING_S = 0.6  # of a position by the last velocity: 0.15 m at its recorded error
-_NEAR_M = 5.0  # distance of the subject, below which the hold lies on the way out
-_FAST_M_S = 1.0  # speed away from him, above which it does anyway
 _STOPPING_S = 1.2  # from 1.5 m/s at braking_m_s2, 1.3
-_MAX_WAY_OUT_M = 1.5  # as max_lead_m
-_LEAD_S = 1.5  # of his way, by which a retreat is ahead of one who comes
-_CLEAR_M = 0.3  # of a retreat, beyond min_distance_m
-_MAX_LEAD_M = 3.0  # of the retreat's place from the vehicle: its speed is bounded by it
-_HOLD_MODE_PATIENCE_S = 5.0  # as engage_timeout_s
-#: Telemetry must arrive for so long after a loss before a mode is requested: longer than the 1 s between two
-#: heartbeats, and than packets that were late and arrive after newer ones.
-_STEADY_S = 1.3
-_DEFAULT_TIMEOUT_S = 0.5  # as max_control_timeout_s, where the autopilot reports none
 #: Out of sight for longer, the reported position may have jumped unseen (``vehicle_filter.py``).
 UNSEEN_S = 0.25
 #: Causes that pass by themselves.  A silent link is none of them: motion does not resume because a link returns.
@@ -65,7 +51,8 @@ def begin_hold(
     """
     vehicle = seen.vehicle
     age_s = max(vehicle.position_age_s, vehicle.age_s)
-    known = located(seen) and age_s <= _DEAD_RECKONING_S
+    # A place continued by the last velocity then errs by 0.15 m at its recorded error.
+    known = located(seen) and age_s <= 0.6
     fresh = known and max(seen.link.age_s, age_s) <= UNSEEN_S
     place, fence = None, None if isinstance(state, Requesting) else state.fence_centre
     if known:
@@ -124,11 +111,13 @@ def _way_out(seen: Observed) -> np.ndarray:
     It does not return to where it was: it would come back fast.
     """
     subject, velocity = seen.subject, seen.vehicle.velocity
-    moves_away = subject.closing_m_s < (0.0 if subject.distance_m < _NEAR_M else -_FAST_M_S)
+    # Within 5 m of him it always lies on the way out, farther off only from 1 m/s on.
+    moves_away = subject.closing_m_s < (0.0 if subject.distance_m < 5.0 else -1.0)
     if subject.position is None or not moves_away:
         return np.zeros(3)
     outward = (seen.vehicle.position - subject.position)[:2] / max(subject.distance_m, 1e-3)
-    way = min((max(subject.approach_m_s, 0.0) - subject.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)
+    # At most max_lead_m.
+    way = min((max(subject.approach_m_s, 0.0) - subject.closing_m_s) * _STOPPING_S, 1.5)
     aside = velocity[:2] - (velocity[:2] @ outward) * outward
     return np.append(way * outward + 0.5 * _STOPPING_S * aside, 0.0)
 
@@ -146,7 +135,8 @@ def update_hold(state: Holding, seen: Observed, now_s: float, blind: bool) -> Ho
         state = dataclasses.replace(state, blind=False, since_s=now_s, hold_mode_s=None)
         if state.position is None:
             state = dataclasses.replace(state, position=seen.vehicle.position.copy(), yaw=seen.vehicle.yaw)
-    late = state.hold_mode_s is not None and now_s - state.hold_mode_s > _HOLD_MODE_PATIENCE_S
+    # As engage_timeout_s.
+    late = state.hold_mode_s is not None and now_s - state.hold_mode_s > 5.0
     if not late or isinstance(state, Fault) or seen.mode.in_hold or state.sight.lost:
         return state
     reason = condition(ConditionCode.HOLD_MODE_MISSING, cause=state.condition)
@@ -162,13 +152,15 @@ def retreat(state: Holding, seen: Observed, now_s: float, config: MavlinkBridgeC
     settled = not state.retreats or state.blind or state.hold_mode_s is not None or seen.mode.in_hold
     if place is None or subject is None or fence is None or settled or not subject_located(seen, config):
         return state
-    wanted = config.min_distance_m + seen.subject.sd_m + _LEAD_S * max(seen.subject.approach_m_s, 0.0) + _CLEAR_M
+    # Ahead of one who comes by 1.5 s of his way, and 0.3 m beyond the minimum distance.
+    wanted = config.min_distance_m + seen.subject.sd_m + 1.5 * max(seen.subject.approach_m_s, 0.0) + 0.3
     if not seen.subject.distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
         return state
     outward = (seen.vehicle.position - subject)[:2] / max(seen.subject.distance_m, 1e-3)
     here = seen.vehicle.position
     step = subject[:2] + wanted * outward - here[:2]
-    step *= min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
+    # The speed of the retreat is bounded by its lead.
+    step *= min(1.0, 3.0 / max(float(np.hypot(*step)), 1e-6))
     target = here[:2] + _share_inside(here, step, fence, config.fence_radius_m) * step
     return dataclasses.replace(state, position=np.append(target, place[2]), retreated_s=now_s)
 
@@ -178,11 +170,13 @@ def request_hold_mode(state: Holding, seen: Observed, now_s: float, config: Mavl
     awaited = not isinstance(state, Fault) and state.hold_mode_s is None and not state.sight.lost
     if not awaited or state.blind or seen.link.packet_loss > MAX_LOSS:
         return state
-    slow = bool(np.linalg.norm(seen.vehicle.velocity) < _AT_REST_M_S)
+    # A velocity at rest errs by as much.
+    slow = bool(np.linalg.norm(seen.vehicle.velocity) < 0.35)
     if slow == (state.slow_s is None):
         state = dataclasses.replace(state, slow_s=now_s if slow else None)
     held_s = now_s - max(state.since_s, state.retreated_s)
-    settled = state.slow_s is not None and now_s - state.slow_s >= _SETTLED_S
+    # A vehicle that springs back is slow for a moment where it turns.
+    settled = state.slow_s is not None and now_s - state.slow_s >= 0.3
     ready = (settled and held_s > _LEAST_S) or held_s > config.hold_s
     return dataclasses.replace(state, hold_mode_s=now_s) if ready else state
 
@@ -215,7 +209,8 @@ def mode_visible(state: SafetyState, seen: Observed, now_s: float, config: Mavli
     The pilot's choice within the age of this report is the only one that a request can override.  Where many packets
     are lost none is requested: such a link ends orbits, and the pilot takes over just then.
     """
-    steady = now_s - state.sight.seen_s >= _STEADY_S and not state.sight.lost
+    # Longer than the 1 s between two heartbeats, and than packets that were late and arrive after newer ones.
+    steady = now_s - state.sight.seen_s >= 1.3 and not state.sight.lost
     late = seen.link.round_trip_s > config.max_round_trip_s  # the request would arrive late too
     return (
         steady and not late and seen.link.packet_loss <= MAX_LOSS and seen.link.heartbeat_age_s <= config.max_mode_age_s
@@ -244,7 +239,8 @@ def stream_ended(seen: Observed) -> bool:
     """
     settings = seen.loss_settings
     timeout_s = math.nan if settings is None else settings.timeout_s
-    return seen.link.stream_gap_s > (_DEFAULT_TIMEOUT_S if math.isnan(timeout_s) else timeout_s)
+    # As max_control_timeout_s, where the autopilot reports none.
+    return seen.link.stream_gap_s > (0.5 if math.isnan(timeout_s) else timeout_s)
 
 
 def _telemetry_fresh(seen: Observed, config: MavlinkBridgeConfig) -> bool:

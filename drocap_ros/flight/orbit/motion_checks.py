@@ -17,10 +17,7 @@ from drocap_ros.flight.vehicle import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_G
 _C = ConditionCode
 REACTION_S = 0.5  # from a step of the subject until the vehicle slows down
 OWN_SPEED_SD_M_S = 0.1  # of the reported velocity
-_LEAST_SUBJECT_AGE_S = 0.25  # the usual age of a picture at 15 Hz, its network included
 WAITING_LEADS = 1.3  # of max_lead_m: beyond it the reference stands
-_SURE = 3.0  # standard deviations
-_CARRIED_OFF = 3.0  # times that limit: beyond the 3.7 m that vehicles were behind walking subjects
 GUST_S = 1.0  # away for so long: a gust passes
 _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
 _FUTURE_S = 0.2  # the clocks of image and step differ by a transmission at most
@@ -187,7 +184,7 @@ def contradicted_height(seen: Observed, *, lower: bool = False) -> Condition | N
     reported = seen.vehicle.height
     for source, height in seen.heights.items():
         surplus = (reported.m - height.m) / math.hypot(reported.sd_m, height.sd_m)
-        if (surplus if lower else abs(surplus)) > _SURE:
+        if (surplus if lower else abs(surplus)) > 3.0:  # standard deviations
             return condition(_C.HEIGHT_CONTRADICTED, height_m=reported.m, source=source, other_m=height.m)
     return None
 
@@ -200,7 +197,8 @@ def keeping_condition(
     Sooner at three times the distance: the vehicle is carried off.
     """
     limit_m = away_limit_m(config)
-    carried_off = seen.course.away_m > _CARRIED_OFF * limit_m
+    # Beyond the 3.7 m that vehicles were behind walking subjects.
+    carried_off = seen.course.away_m > 3.0 * limit_m
     if carried_off:
         longest_s = min(longest_s, GUST_S)
     if seen.course.away_s <= longest_s:
@@ -289,7 +287,8 @@ def oldest_subject_s(seen: Observed, safety: SafetyConfig) -> float:
     velocity = seen.vehicle.velocity
     velocity = velocity if np.isfinite(velocity).all() else np.nan_to_num(velocity)
     speed = math.sqrt(velocity @ velocity)
-    return min(safety.max_subject_age_s, max(safety.max_blind_m / max(speed, 1e-3), _LEAST_SUBJECT_AGE_S))
+    # At least the usual age of a picture at 15 Hz, its network included.
+    return min(safety.max_subject_age_s, max(safety.max_blind_m / max(speed, 1e-3), 0.25))
 
 
 def subject_located(seen: Observed, safety: SafetyConfig) -> bool:

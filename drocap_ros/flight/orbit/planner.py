@@ -19,8 +19,6 @@ from drocap_ros.flight.orbit.motion_checks import REACTION_S
 from drocap_ros.flight.orbit.speed import allowed_angular_speed, approach_speed, waiting
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
-_TRIM_RATE = 0.15  # 1/s, about one who stands
-_WALKING_TRIM_RATE = 0.03  # 1/s: the turns of one who walks are no lasting error
 _CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
 _FORWARD = 0.5  # m/s^2: most of it that is passed on, from 1 m/s beyond one who stands: slower, it is noise
 _MAX_HASTE = 0.12  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
@@ -149,7 +147,8 @@ def advance(state: OrbitState, goal: OrbitGoal, scene: Scene, dt: float, config:
         error = radius.value - float(np.hypot(*(vehicle[:2] - subject[:2])))
         error = min(max(error, -1.0), 1.0)
         most = min(max(radius.value - least_radius_m, 0.0), FLIGHT_ERROR_M)  # no nearer than the least radius
-        rate = _TRIM_RATE if math.hypot(*centre_velocity) < WALKING_M_S else _WALKING_TRIM_RATE
+        # 1/s: the turns of one who walks are no lasting error.
+        rate = 0.15 if math.hypot(*centre_velocity) < WALKING_M_S else 0.03
         trim = min(max(trim + rate * error * dt, -most), FLIGHT_ERROR_M)
     phase = math.remainder(phase, 2 * math.pi)
     return OrbitState(phase, omega, radius, height, *followed, trim, state.flown_s + dt, goal_radius)

@@ -50,7 +50,6 @@ from drocap_ros.flight.orbit.states import (
 from drocap_ros.flight.orbit.watchdog import GIVE_UP_S
 
 _C = ConditionCode
-_BLIND_MODE_REQUEST_S = 2.0  # of velocity zero, from 2.5 m/s at braking_m_s2: a brake by the mode takes longer
 _INTENTION_S = 2.0 / CURRENT_MODE_HZ  # two periods of CURRENT_MODE, which says what is intended
 
 
@@ -61,10 +60,7 @@ def reduce(
 
     now_s : monotonic
     command : the operator's, or None
-
-    Returns
-    -------
-    The next state, and what may be sent until the step after it.
+    returns : the next state, and what may be sent until the step after it
     """
     state = watch(state, seen, now_s, config)
     sight = state.sight
@@ -326,7 +322,8 @@ def _permitted_in_hold(
         action = Action.NOTHING
     # Not at once: the autopilot's brake takes longer than velocity zero.  And not without a visible mode: the pilot
     # may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
-    wanted = since > _BLIND_MODE_REQUEST_S if state.blind else state.hold_mode_s is not None
+    # At velocity zero for 2 s, from 2.5 m/s at braking_m_s2: a brake by the mode takes longer.
+    wanted = since > 2.0 if state.blind else state.hold_mode_s is not None
     return action, ModeRequest.HOLD if wanted and mode_visible(state, seen, now_s, config) else ModeRequest.NONE
 
 

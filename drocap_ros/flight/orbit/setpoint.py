@@ -45,10 +45,6 @@ _LEAST_SD_M = 0.05  # of a height
 #: m; no coast, the creep after its stop included, brings the vehicle by more nearer to the subject: 1 m is required of
 #: the bridge's death (benchmarks/flight_kills.py), and the prediction errs.
 _NEARER_M = 0.9
-#: Share of a steady flight's and of the subject's speed, by which setpoint and way together may ask more than a steady
-#: flight's of a vehicle that holds setpoints.  A far place lets it fly faster than predicted: after it had caught up
-#: with a walker it went on for 3.1 m.
-_PULLED = 0.25
 _SLACK_M = 0.2  # what the vehicle has already is no effect of the setpoint
 #: Levels that are tried, one after the other, see :func:`_shares`: of the setpoint's part along and of that across the
 #: line of sight, both at once or the one across first.  A step is a fifth of the speed, a quarter or half of the way.
@@ -56,10 +52,6 @@ _LEVELS = (2.0, 1.5, 1.0, 0.8, 0.6, 0.4, 0.2)
 _TRIES = [(level, level) for level in _LEVELS]
 _TRIES_ACROSS_FIRST = [(2.0, across) for across in (2.0, 1.75, 1.5, 1.25, 1.0, 0.8, 0.6, 0.4)]
 _TRIES_ACROSS_FIRST += [(level, min(level, 0.4)) for level in _LEVELS[1:]]
-_HALVINGS = 3  # between two levels, where setpoints are held: a vehicle that lacks more retreats no more slowly
-_RATE_PER_S2 = 0.8  # of the missing velocity
-_FORGETTING_PER_S = 0.1  # of what was missing: gusts pass
-_MOST_M_S2 = 0.6  # that is added behind one who walks, 1 m/s faster than one seems to who stands: he needs none
 
 
 class FlownOrbit:
@@ -199,7 +191,8 @@ class _Coasting(NamedTuple):
         """The greatest harmless part between levels that are harmless and others above that are not."""
         least, greatest = np.array(levels), np.array(above)
         part = self.part(setpoint, *least)[0]
-        for _ in range(_HALVINGS):
+        # Finer than an eighth, a vehicle that holds setpoints retreats no more slowly.
+        for _ in range(3):
             middle = 0.5 * (least + greatest)
             more, danger, too_long = self.part(setpoint, *middle)
             if danger is None and not too_long:
@@ -265,7 +258,9 @@ def harmless(
     """
     held, velocity = not seen.autopilot.continues_setpoints, complex(*seen.subject.velocity[:2])
     longest_m, steady_m_s = seen.autopilot.greatest_coast * config.max_coast_m, coast_speed(seen, config)
-    fastest_m_s = steady_m_s + _PULLED * (steady_m_s + abs(velocity)) if held else math.inf
+    # Setpoint and way together may ask more by a quarter of a steady flight's and of the subject's speed.  A far place
+    # lets a vehicle that holds setpoints fly faster than predicted: behind a walker it went on for 3.1 m.
+    fastest_m_s = steady_m_s + 0.25 * (steady_m_s + abs(velocity)) if held else math.inf
     judge = _Coasting(seen, velocity, fence_centre, config, longest_m, fastest_m_s)
     across_first = seen.subject.position is not None and (held or abs(velocity) > WALKING_M_S)
     tries, problem = _TRIES_ACROSS_FIRST if across_first else _TRIES, None
@@ -323,7 +318,8 @@ class Shortfall:
         sight = subject[:2] - seen.vehicle.position[:2]
         toward = sight / max(float(np.hypot(*sight)), 0.5)
         speed = float(np.hypot(*subject_velocity))
-        most = _MOST_M_S2 * min(max(speed - STANDING_M_S, 0.0), 1.0)
+        # Whole behind one who walks 1 m/s faster than one seems to who stands: he needs none.
+        most = 0.6 * min(max(speed - STANDING_M_S, 0.0), 1.0)
         along = min(max(float(self._integral @ toward), -most), most)
         return setpoint._replace(acceleration=setpoint.acceleration + np.append(along * toward, 0.0))
 
@@ -332,6 +328,7 @@ class Shortfall:
         wanted = sent.velocity + seen.autopilot.position_gain_per_s * (sent.position - seen.vehicle.position)
         missing = (wanted - seen.vehicle.velocity)[:2]
         dt = min(max(dt, 0.0), 0.2)
-        self._integral = self._integral + (_RATE_PER_S2 * missing - _FORGETTING_PER_S * self._integral) * dt
+        # What was missing is forgotten in 10 s: gusts pass.
+        self._integral = self._integral + (0.8 * missing - 0.1 * self._integral) * dt
         size = math.hypot(*self._integral)
         self._integral = self._integral * min(1.0, 1.0 / max(size, 1e-9))  # m/s^2 at most

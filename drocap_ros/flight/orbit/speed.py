@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +35,6 @@ from drocap_ros.flight.orbit.states import Pace
 from drocap_ros.flight.subject.guard import farness
 
 _C = ConditionCode
-_FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
-_USUAL_SUBJECT_AGE_S = 0.24  # a camera at 15 Hz, and 0.17 s for its network
 _STANDING_AGE = 5 / 6  # of max_subject_age_s, 0.33 s: the last moving setpoint
 _LEAST_PACE = 0.3  # share of its speed at which an orbit gives way still: one that stands would not
 _CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
@@ -111,7 +108,8 @@ def waiting(lead_m: float, most_m: float) -> tuple[float, float]:
 
     The ramp to the first one is too slow for a vehicle that suddenly falls behind.
     """
-    share = (most_m - lead_m) / ((1 - _FREE_LEAD) * most_m)
+    # The reference does not wait below 0.6 of the greatest lead.
+    share = (most_m - lead_m) / (0.4 * most_m)
     at_once = (WAITING_LEADS * most_m - lead_m) / (0.3 * most_m)  # from one greatest lead to 1.3 of them
     return min(max(share, 0.0), 1.0), min(max(at_once, 0.0), 1.0)
 
@@ -133,7 +131,8 @@ def allowed_pace(seen: Observed, config: MavlinkBridgeConfig) -> tuple[float, Co
     usual_s = config.max_state_age_s
     halt_s = 0.5 * (usual_s + oldest_state_s(config, patient=True))
     subject_s = min(oldest_subject_s(seen, config), _STANDING_AGE * config.max_subject_age_s)
-    usual_subject_s = min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s)
+    # A camera at 15 Hz, and 0.17 s for its network.
+    usual_subject_s = min(0.24, 0.8 * subject_s)
     ages = (
         (seen.link.age_s, _C.LINK_SILENT),
         (seen.vehicle.age_s, _C.ATTITUDE_OUTDATED),
@@ -201,44 +200,26 @@ def slowed(setpoint: Setpoint, pace: Pace, max_acceleration_m_s2: float) -> Setp
 # -- towards the subject ----------------------------------------------------------------------------------------------
 
 
-class _Closing(NamedTuple):
-    """What bounds the speed towards the subject.
-
-    overshoot : share of the greatest closing speed that a setpoint has: the vehicle overshoots
-    surely_m_s : so much faster than by the estimated place he may recede by his image, which shrinks as he bends
-    far_error_m_s : that his receding must exceed far away: from 12 m one who stands recedes at up to 0.4 m/s
-    step_m_s : most that a setpoint adds to the present closing speed towards one who stands, where setpoints are
-        continued: the vehicle overshoots a larger step
-    stops : share of the speed at which such a vehicle follows a walker, by which it closes up more slowly: a stop is
-        seen 0.4 s late
-    """
-
-    overshoot: float = 0.85
-    surely_m_s: float = 0.1
-    far_error_m_s: float = 0.3
-    step_m_s: float = 0.4
-    stops: float = 0.3
-
-
-_CLOSING = _Closing()
-
-
 def limit_closing(setpoint: Setpoint, seen: Observed, config: MavlinkBridgeConfig) -> Setpoint:
     """The setpoint with no more speed towards the subject than his size allows."""
     sight = seen.subject.by_size
     if sight is None:
         return setpoint
     room = math.sqrt(2 * config.braking_m_s2 * max(sight.nearest_m - config.min_distance_m, 0.0))
-    receding = min(sight.receding_m_s, max(-seen.subject.approach_m_s, 0.0) + _CLOSING.surely_m_s)
-    receding = min(receding, max(receding - farness(sight.distance_m) * _CLOSING.far_error_m_s, 0.0))
-    closing_up = _CLOSING.overshoot * config.max_closing_m_s
+    # He may recede a little faster by his image, which shrinks as he bends, than by the estimated place; seen from 12 m
+    # one who stands recedes at up to 0.4 m/s.
+    receding = min(sight.receding_m_s, max(-seen.subject.approach_m_s, 0.0) + 0.1)
+    receding = min(receding, max(receding - farness(sight.distance_m) * 0.3, 0.0))
+    closing_up = 0.85 * config.max_closing_m_s  # the vehicle overshoots
     allowed = min(max(closing_up + receding, 0.0), room)
     if seen.autopilot.continues_setpoints:
         closing = float(seen.vehicle.velocity[:2] @ sight.toward)
-        allowed -= _CLOSING.stops * min(max(receding, 0.0), closing_up)
+        # Behind a walker such a vehicle closes up more slowly: a stop is seen 0.4 s late.
+        allowed -= 0.3 * min(max(receding, 0.0), closing_up)
         # Its path, limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.3 m/s without this.
         allowed += min(closing, 0.0)
-        allowed = max(min(allowed, max(closing, 0.0) + _CLOSING.step_m_s + receding), 0.0)
+        # It overshoots a larger step of the closing speed towards one who stands.
+        allowed = max(min(allowed, max(closing, 0.0) + 0.4 + receding), 0.0)
     return _bounded(setpoint, seen, sight, allowed, config.max_acceleration_m_s2)
 
 

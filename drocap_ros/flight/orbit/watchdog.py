@@ -8,10 +8,7 @@ from typing import NamedTuple
 
 from drocap_ros.flight.mavlink.commands import Message
 
-_PERIOD_S = 0.1  # between setpoints: five within the autopilot's time-out of 0.5 s
-_CHECK_S = 0.02  # between looks at the loop: a tenth of watchdog_s
 GIVE_UP_S = 10.0  # without a step: the hold mode was requested long ago, and the loop does not return
-_STOPPED_S = 0.5  # for which this thread stood too: the autopilot's time-out
 
 
 class FallbackCommands(NamedTuple):
@@ -62,10 +59,11 @@ class Watchdog:
         gap_s, self._checked_s = now_s - max(self._checked_s, step_s), now_s
         if gap_s > self._limit_s:  # the whole process was stopped, the loop too: both resume together
             self._stood_s += gap_s
-        if self._stood_s > _STOPPED_S:
+        if self._stood_s > 0.5:
             return  # the autopilot's time-out has ended the motion; the position of the last step is outdated
         silent_s = now_s - step_s
-        if commands is None or not self._limit_s < silent_s < GIVE_UP_S or now_s - self._sent_s < _PERIOD_S:
+        # Five setpoints within the autopilot's time-out of 0.5 s.
+        if commands is None or not self._limit_s < silent_s < GIVE_UP_S or now_s - self._sent_s < 0.1:
             return
         if commands.left():
             self.kick(step_s, None)
@@ -100,5 +98,6 @@ class Watchdog:
             self._thread.join(1.0)
 
     def _run(self, now_s: Callable[[], float]) -> None:
-        while not self._stop.wait(_CHECK_S):
+        # A tenth of watchdog_s.
+        while not self._stop.wait(0.02):
             self.step(now_s())

@@ -22,12 +22,6 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 _GRAVITY = 9.81  # m/s^2
 _HALF_WIDTH_M = 0.3  # of a person with the arms
 _HEADROOM_M = 0.1  # above the head
-_GUSTS = 1.2  # times the lean by the mean wind
-_RESERVE_M_S2 = 0.4  # of corrections
-_LEAST_UP = 0.3  # of the body's axis; beyond it the vehicle tumbles
-_STILL_M_S = 0.5  # a hover: below it for so long, the vehicle leans by the wind alone
-_SETTLED_S = 1.0  # the lean of the braking before has gone
-_CUT_OFF = 0.2  # share of the picture's height by which a mount may cut off feet or head: it does not lean further
 
 
 class View(NamedTuple):
@@ -84,7 +78,8 @@ def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float)
     if view.level:
         none = np.zeros(1)
         return float(framing_margin(view, goal.radius_m, goal.height_m, body_height_m, none, none)[0])
-    lean = _GUSTS * wind + _RESERVE_M_S2
+    # Gusts are 1.2 times the mean wind; corrections take 0.4 m/s^2.
+    lean = 1.2 * wind + 0.4
     # Directions of the nose against the wind, by 30 deg.
     around = np.linspace(0.0, 2 * math.pi, 12, endpoint=False)
     inward = np.array([[0.0], [goal.angular_speed_rad_s**2 * goal.radius_m]])
@@ -144,12 +139,14 @@ class Framing:
         if view is None or view.level or not np.isfinite(vehicle.orientation_xyzw).all():
             return
         up = matrix_from_quaternion(vehicle.orientation_xyzw)[:, 2]
-        if up[2] < _LEAST_UP:
+        # The body's axis leans further where the vehicle tumbles.
+        if up[2] < 0.3:
             return
         step_s = min(max(dt, 0.0), 0.2)
         # Only a hover leans by the wind alone.
-        self._still_s = self._still_s + step_s if float(np.hypot(*velocity[:2])) < _STILL_M_S else 0.0
-        if self._still_s > _SETTLED_S:
+        self._still_s = self._still_s + step_s if float(np.hypot(*velocity[:2])) < 0.5 else 0.0
+        # The lean of the braking before has gone after a second.
+        if self._still_s > 1.0:
             # The lean against wind is learned over 4 s: a gust passes, the wind stays.
             self._learned_s = min(self._learned_s + step_s, 4.0)
             share = step_s / max(self._learned_s, 1e-3)
@@ -161,7 +158,8 @@ class Framing:
         if view is None:
             return None
         margin = orbit_margin(view, goal, config.body_height_m, float(np.hypot(*self._wind)))
-        if margin >= (-_CUT_OFF if view.level else 0.0):
+        # A mount may cut off a fifth of the picture of feet or head: it does not lean further.
+        if margin >= (-0.2 if view.level else 0.0):
             return None
         return condition(
             ConditionCode.PERSON_LEAVES_PICTURE,

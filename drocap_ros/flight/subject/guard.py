@@ -25,16 +25,10 @@ from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.stamps import NS
 
-#: s; older pictures count less.  An orbit of 11 deg/s takes 33 s; the height of the worse autopilot wanders for longer.
-_MEMORY_S = 30.0
-_FORGETTING_M_S = 0.9  # of one who walks, at which a second is forgotten: his way is no error of the range
-#: s, for which errors of the vehicle's position last: recorded ones of both autopilots halve within 2 s.
-_LASTS_S = 5.0
 _LEAST_RESIDUAL_M2 = 0.05**2  # a body that stands sways: residuals that are smaller are chance
 #: Spread of the directions, as of an arc of 45 degrees (a whole circle has 1), below which they show nothing: the noise
 #: of bearings looks like a small arc, and a range that changes before a vehicle that hovers like any scale.
 _LEAST_SPREAD = 0.05
-_MOST = 2.0  # standard deviations of the range by body size, by which the scale is corrected at most
 
 
 class Parallax:
@@ -57,9 +51,11 @@ class Parallax:
         seconds : since the picture before
         speed_m_s : of the subject as estimated; of one who stands it errs by 0.5 m/s, and by 1 m/s for a moment
         """
-        kept = math.exp(-seconds * (speed_m_s / _FORGETTING_M_S) ** 8)
+        # The way of one who walks at 0.9 m/s is no error of the range: a second of it is forgotten.
+        kept = math.exp(-seconds * (speed_m_s / 0.9) ** 8)
         self._prior = self.scale + kept * (self._prior - self.scale)
-        fade = kept * math.exp(-seconds / _MEMORY_S)
+        # An orbit of 11 deg/s takes 33 s; the height of the worse autopilot wanders for longer.
+        fade = kept * math.exp(-seconds / 30.0)
         self._seconds = fade * self._seconds + seconds
         distance = float(np.hypot(*sight))
         toward = sight / max(distance, 1e-3)
@@ -72,22 +68,19 @@ class Parallax:
         radius = -both / max(spread, _LEAST_SPREAD)
         residual = max(places - radius**2 * spread, _LEAST_RESIDUAL_M2)
         known, measured = self._size_error**-2, float(mean[6])
-        shown = self._seconds / _LASTS_S * measured**2 * max(spread - _LEAST_SPREAD, 0.0) / residual
+        # Errors of the vehicle's position last for less than 5 s: recorded ones of both autopilots halve within 2 s.
+        shown = self._seconds / 5.0 * measured**2 * max(spread - _LEAST_SPREAD, 0.0) / residual
         scale = (known * self._prior + shown * radius / max(measured, 1e-3)) / (known + shown)
-        most = _MOST * self._size_error
+        # Two standard deviations of the range by body size.
+        most = 2.0 * self._size_error
         self.scale = float(min(max(scale, 1.0 - most), 1.0 + most))
 
 
 _BEARING_NOISE = 0.01  # share of the range
 _NOISE_M = 0.04  # of a place, whatever its range
-_ACCELERATION = 0.7  # m/s^2: standard deviation of the change of the subject's velocity in a second
-_BEARING_GATE = 4.0  # standard deviations across the sight
-_SIZE_GATE = 0.35  # share of the range along it
-_SURE = 0.5  # standard deviations of the speed at which he walks away that are left out
 #: m/s over the square of the seconds for which he recedes, far and near: the speed at which he may be followed.  A body
 #: that swings or crouches shrinks too, for a second or two.
 _AWAY_FAR, _AWAY_NEAR = 0.14, 0.3
-_RESTART_S = 1.0  # without a sure image, after which any image is sure, unless the vehicle flies by him
 #: m, where the distance begins to count and where it counts whole: an error of the size is an error of the speed in
 #: proportion to the distance.
 _NEAR_M, _FAR_M = 8.0, 12.0
@@ -129,7 +122,8 @@ class Guard:
     ) -> bool:
         """Begin with a place, or take it; returns whether the subject can be there."""
         gap_s, other = (observation.stamp_ns - self._stamp_ns) / NS, observation.track_id != self._track_id
-        if self._state is None or (not locked and (other or abs(gap_s) > _RESTART_S)):
+        # After a second without a sure image any image is sure, unless the vehicle flies by him.
+        if self._state is None or (not locked and (other or abs(gap_s) > 1.0)):
             self._start(found.position[:2], observation)
             return True
         if gap_s <= 0 or other:
@@ -181,7 +175,8 @@ class Guard:
         spread = basis @ covariance[:2, :2] @ basis.T + noise
         usual = 2 * math.sqrt(spread[0, 0])
         surprise = max(abs(innovation[0]) - usual, 0.0)
-        if abs(innovation[1]) > _BEARING_GATE * math.sqrt(spread[1, 1]) or surprise > _SIZE_GATE * distance:
+        # Four standard deviations across the sight, a third of the range along it.
+        if abs(innovation[1]) > 4.0 * math.sqrt(spread[1, 1]) or surprise > 0.35 * distance:
             return False
         spread[0, 0] += surprise**2
         gain = covariance[:, :2] @ basis.T @ np.linalg.inv(spread)
@@ -203,7 +198,8 @@ class Guard:
         assert self._state is not None
         move = _STAYS + dt * _MOVES
         push = 0.5 * dt * dt * _STAYS[:, :2] + dt * _STAYS[:, 2:]
-        noise = _ACCELERATION**2 / max(dt, 1e-3) * push @ push.T
+        # m/s^2, of the subject's velocity in a second.
+        noise = 0.7**2 / max(dt, 1e-3) * push @ push.T
         return move @ self._state, move @ self._covariance @ move.T + noise
 
     def _receding(self, inward: np.ndarray, estimate: tuple[np.ndarray, np.ndarray]) -> float:
@@ -211,7 +207,8 @@ class Guard:
         state, covariance = estimate
         speed = float(state[2:] @ inward)
         sd = math.sqrt(max(float(inward @ covariance[2:, 2:] @ inward), 0.0))
-        return math.copysign(max(abs(speed) - _SURE * sd, 0.0), speed)
+        # Half a standard deviation is left out.
+        return math.copysign(max(abs(speed) - 0.5 * sd, 0.0), speed)
 
 
 def farness(distance_m: float) -> float:

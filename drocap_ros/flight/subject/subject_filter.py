@@ -24,8 +24,6 @@ _MEMORY, _WANDERING = (4 * NS, 15), (1 * NS, 8)
 _QUANTILE = (
     0.6  # of the ground's height, a little more than the median: bending makes the body look smaller, so farther
 )
-_NEARER_S = 1.0  # filter of what the two ranges disagree by
-_MAX_SURPRISE = 0.3  # share of the range, beyond which the gate decides
 #: (6, 6): a place and a velocity that stay, and by the second what the velocity adds to the place.
 _STAYS, _MOVES = np.eye(6), np.eye(6, k=3)
 
@@ -68,7 +66,8 @@ def _range_noise(
     ahead = np.array([along[0], along[1], 0.0])
     usual = 2.0 * float(np.sqrt(ahead @ (covariance + measurement.noise) @ ahead))
     surprise = abs(float(innovation @ ahead)) - usual
-    if not 0.0 < surprise < _MAX_SURPRISE * distance:
+    # Beyond a third of the range the gate decides.
+    if not 0.0 < surprise < 0.3 * distance:
         return np.zeros((3, 3))
     return surprise**2 * np.outer(along, along)
 
@@ -132,7 +131,7 @@ class SubjectFilter:
         self._covariance = 0.5 * (covariance + covariance.T)
         self._systematic = measurement.systematic
         self._stamp_ns, self._contradicted = observation.stamp_ns, False
-        self._nearer += (measurement.nearer - self._nearer) * min(gap_s / _NEARER_S, 1.0)
+        self._nearer += (measurement.nearer - self._nearer) * min(gap_s, 1.0)  # over a second
         self._learn_ground(measurement, observation.stamp_ns)
         self._parallax.take(camera.position[:2], sight[:2], gap_s, float(np.hypot(*self._state[3:5])))
         return True

@@ -38,37 +38,11 @@ _TRUNK = np.array([BODY_15.index(name) for name in ("pelvis", "rhip", "lhip", "n
 _NECK = BODY_15.index("neck")
 _ANKLE_HEIGHT = 0.055  # share of the stature; a swinging foot lifts the mean a little
 _PELVIS_HEIGHT = 0.53  # share of the stature (Winter), standing
-_CONFIDENCE = 0.25  # below it a joint counts as not seen
 _STEEP = np.sin(np.deg2rad(75.0))
 _SHALLOW = np.sin(np.deg2rad(4.0))
-_THIRD_LONGEST = 0.99  # of the true length
 SIZE_NOISE = 0.06  # of one image, share of the range
 BENT = 4.0  # times the noise: a bent body looks smaller, as does a trunk that leans; its size counts for less
 MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
-
-
-class _Noise(NamedTuple):
-    """Standard deviations, of one image where nothing else is said; shares of the range where there is no unit.
-
-    ground, bearing : of the range by the ground, and across the sight
-    lifted : feet that are farther apart: one is lifted
-    apart : of the distance between the feet
-    stride_m : of the mean of the feet about the pelvis
-    lean_rad : of the body; looking down by a slope it changes lengths by as much
-    feet_m, pelvis_m : of the ground, by feet of which one is lifted, and by the pelvis of one who may crouch
-    """
-
-    ground: float = 0.025
-    bearing: float = 0.008
-    lifted: float = 0.15
-    apart: float = 0.1
-    stride_m: float = 0.15
-    lean_rad: float = 0.12
-    feet_m: float = 0.1
-    pelvis_m: float = 0.3
-
-
-_NOISE = _Noise()
 
 
 class SubjectMeasurement(NamedTuple):
@@ -108,17 +82,14 @@ def locate_subject(
     camera : pose at the stamp of the observation
     known : his ground by his body over the last seconds; unknown = that of this image.  It changes slowly by the
         assumptions, and quickly when the subject crouches: then the feet on it are right
-
-    Returns
-    -------
-    None without a subject, with too few visible joints, or when the camera looks straight down on it.
+    returns : None without a subject, with too few visible joints, or when the camera looks straight down on it
     """
     if not observation.has_subject or len(observation.keypoints) == 0:
         return None
     points, confidence = joint_map(observation.joints.name).places(
         observation.keypoints.astype(float), observation.confidence.astype(float)
     )
-    seen = np.isfinite(points).all(axis=1) & (confidence >= _CONFIDENCE)
+    seen = np.isfinite(points).all(axis=1) & (confidence >= 0.25)  # less counts as not seen
     trunk = _TRUNK[seen[_TRUNK]]
     if len(trunk) == 0:
         return None
@@ -133,7 +104,8 @@ def locate_subject(
         return None
     slope = float(pelvis[2] / flat)
     size, bending = _range_from_size(rays, seen, pelvis[:2] / flat, config)
-    size_error = float(np.hypot(config.size_error, _NOISE.lean_rad * slope))
+    # A body leans by 0.12 rad; looking down by a slope that changes lengths by as much.
+    size_error = float(np.hypot(config.size_error, 0.12 * slope))
     ground, height, noise = _range_from_ground(rays, seen, camera.position, config)
     steady = size
     if np.isfinite(known.m) and np.isfinite(ground):  # the feet on the known ground
@@ -165,7 +137,7 @@ def locate_subject(
     # Feet give a precise range from image to image, bones do not.
     if not np.isfinite(noise):
         noise = (BENT if np.isinf(bending) else 1.0) * SIZE_NOISE * distance + 0.05
-    across = _NOISE.bearing * distance + 0.03
+    across = 0.008 * distance + 0.03
     level = _ground_by_body(size, size_error, rays, seen, camera.position, config)
     return SubjectMeasurement(position, spread(noise, across), spread(sd, turn), size, ground, bending, nearer, level)
 
@@ -197,7 +169,8 @@ def _range_from_size(
         length = max(length, float(lengths[0]))
     if length < 1e-6:
         return float("nan"), float("nan")
-    return _THIRD_LONGEST / length, float(np.log(order[1] / max(order[min(3, len(order) - 1)], 1e-6)))
+    # The third longest has 0.99 of the true length.
+    return 0.99 / length, float(np.log(order[1] / max(order[min(3, len(order) - 1)], 1e-6)))
 
 
 def _range_from_ground(
@@ -213,9 +186,9 @@ def _range_from_ground(
     ranges = height * np.hypot(ankles[:, 0], ankles[:, 1]) / -ankles[:, 2]
     apart, nearer = float(np.ptp(ranges)), float(ranges.min())
     # A lifted foot appears farther than the one that stands; feet a stride apart stand about the pelvis.
-    lifted = apart > _NOISE.lifted * nearer
+    lifted = apart > 0.15 * nearer
     distance = nearer if lifted else float(ranges.mean())
-    noise = _NOISE.ground * distance + 0.05 + _NOISE.apart * min(apart, 0.5 * nearer)
+    noise = 0.025 * distance + 0.05 + 0.1 * min(apart, 0.5 * nearer)
     return distance, height, noise
 
 
@@ -226,9 +199,10 @@ def _ground_by_body(
 
     It needs no ground plane, and holds where feet appear at the horizon or above it: of a camera as low as they are.
     """
-    joints, above, sd = _ANKLES[seen[_ANKLES]], _ANKLE_HEIGHT, _NOISE.feet_m
+    # One of the feet is lifted by 0.1 m; the pelvis of one who may crouch is lower by 0.3 m.
+    joints, above, sd = _ANKLES[seen[_ANKLES]], _ANKLE_HEIGHT, 0.1
     if len(joints) == 0:
-        joints, above, sd = _TRUNK[:1][seen[_TRUNK[:1]]], _PELVIS_HEIGHT, _NOISE.pelvis_m
+        joints, above, sd = _TRUNK[:1][seen[_TRUNK[:1]]], _PELVIS_HEIGHT, 0.3
     if len(joints) == 0 or not np.isfinite(size):
         return NO_HEIGHT
     slope = float((rays[joints, 2] / np.maximum(np.hypot(rays[joints, 0], rays[joints, 1]), 1e-6)).mean())
@@ -240,7 +214,8 @@ def _ground_by_body(
 def _ground_sd(distance: float, height: float, config: SubjectConfig) -> float:
     """Standard deviation of a range of this length by the ground."""
     turn = np.deg2rad(config.attitude_error_deg)
-    errors = (turn * (height**2 + distance**2) / height, config.height_error_m * distance / height, _NOISE.stride_m)
+    # The mean of the feet errs by 0.15 m about the pelvis: strides.
+    errors = (turn * (height**2 + distance**2) / height, config.height_error_m * distance / height, 0.15)
     return float(np.linalg.norm(errors))
 
 

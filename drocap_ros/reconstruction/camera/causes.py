@@ -18,15 +18,6 @@ from drocap_ros.reconstruction.camera.path_residuals import OUTLIER_SQUARE, Path
 from drocap_ros.reconstruction.common.engine import band_factor, forward
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 
-#: Share of the difference that one cause explains, at least, to be named.
-_LEAST_SHARE = 0.6
-#: Difference beyond configured slow errors, per unknown of a knot, below which nothing has to be explained.
-_ORDINARY = 1.0
-#: Standard deviations by which a cause has to explain more than another one.
-_APART = 3.0
-#: Weight of an observation that fits, and the share of a frame's points with it, below which most lie elsewhere.
-_FITS = 0.25
-_FEW = 0.25
 #: The causes: what is off, and its unit per rad; or per s of a path that was reported so much too early, as stamps are
 #: corrected the other way.
 _DEG, _MS = 180.0 / np.pi, -1000.0
@@ -79,11 +70,13 @@ def single_causes(
     y = forward(factor, seen)
     gram = (columns.T @ seen - y.T @ y) / config.views_per_fact
     total = float(gram[0, 0])
-    if total < _ORDINARY * knots.count * KNOT / config.views_per_fact:
+    # One per unknown of a knot is what the configured slow errors explain.
+    if total < knots.count * KNOT / config.views_per_fact:
         return []
     size = gram[1:, 0] / np.diag(gram)[1:]
     std, gain = np.diag(gram)[1:] ** -0.5, size * gram[1:, 0]
-    order = [int(i) for i in np.argsort(-gain) if gain[i] > gain.max() - _APART**2 and gain[i] > _LEAST_SHARE * total]
+    # Another cause explains less by three standard deviations, or not most of the difference.
+    order = [int(i) for i in np.argsort(-gain) if gain[i] > gain.max() - 3.0**2 and gain[i] > 0.6 * total]
     return [
         {
             "cause": _CAUSES[i][0],
@@ -120,5 +113,7 @@ def _product(band: np.ndarray, columns: np.ndarray) -> np.ndarray:
 def contradicted_share(found: AdjustedPath) -> float:
     """Share of the frames whose points lie elsewhere than the corrected path sees most of them."""
     frame, frames = found.views.frame, len(found.rotation)
-    seen, fit = np.bincount(frame, minlength=frames), np.bincount(frame, found.weight > _FITS, minlength=frames)
-    return float(((seen >= ENOUGH_POINTS) & (fit < _FEW * seen)).mean())
+    # An observation fits with a quarter of the weight.
+    seen, fit = np.bincount(frame, minlength=frames), np.bincount(frame, found.weight > 0.25, minlength=frames)
+    # Where fewer than a quarter of the points fit, most lie elsewhere.
+    return float(((seen >= ENOUGH_POINTS) & (fit < 0.25 * seen)).mean())

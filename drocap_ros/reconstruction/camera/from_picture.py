@@ -30,20 +30,11 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 #: Focal length of an unknown lens over the image's longer side, and the deviation of its logarithm: a factor of 1.4.
 FOCAL_SHARE: float = BundleAdjusterConfig.assumed_focal
 FOCAL_STD = 0.34
-#: Factors on it from which an unknown lens is sought.
-_FOCAL_STARTS = (0.7, 1.0, 1.5)
 #: Keyframes after which the starts are compared, and residuals over the least that are as good.
 _COMPARED = 16
 _AS_GOOD = 1.05
-#: Parallax (rad) of the best pair below which a camera moves little, and tangents of the angle from the image's middle
-#: up to the horizon that are tried then: of cameras that look down by 15, 40 and 0 degrees.
-_LITTLE_PARALLAX = 0.02
-_HORIZONS = (0.26, 0.8, 0.0)
-#: Share of the keyframes that need a camera, and the largest residual (px of an image 1280 wide) of a path that fits.
+#: Share of the keyframes that need a camera.
 _LEAST_KNOWN = 0.6
-_LARGEST_PX = 2.5
-#: Share of the observations that fit the path, at least: fewer, and what moves outnumbers what stands.
-_LEAST_FITTING = 0.4
 
 
 class _Start(NamedTuple):
@@ -104,7 +95,7 @@ def _moving(sightings: Sightings, camera: _Start, fps: float, key_hz: float) -> 
         return Kind.NOTHING_FIXED, camera
     least = min(start.path.residual_px for _, start in starts)
     small = None
-    if starts[0][0] < _LITTLE_PARALLAX:
+    if starts[0][0] < 0.02:  # rad of parallax: the camera moves little
         small = _small_motion(sightings, camera, fps, _AS_GOOD * least)
     if small is None or small.residual_px > _AS_GOOD * least:
         # Where there is little parallax any path fits: of starts that fit as well the one with the most of it counts.
@@ -122,7 +113,8 @@ def _moving(sightings: Sightings, camera: _Start, fps: float, key_hz: float) -> 
 def _small_motion(sightings: Sightings, camera: _Start, fps: float, enough_px: float) -> AdjustedPath | None:
     """The best path of a camera that moves little, of some that it may look down; the first one that fits."""
     best: AdjustedPath | None = None
-    for horizon in _HORIZONS:
+    # Tangents up to the horizon, of cameras that look down by 15, 40 and 0 degrees.
+    for horizon in (0.26, 0.8, 0.0):
         found = small_motion(sightings, camera.matrix, fps, camera.focal_std, horizon)
         if found is not None and (best is None or found.residual_px < best.residual_px):
             best = found
@@ -144,7 +136,7 @@ def _starts(sightings: Sightings, camera: _Start, key_hz: float) -> list[tuple[f
     """Paths of some keyframes about every promising pair, with its parallax (rad), those that tell most first."""
     growths: list[tuple[Pair, Growth]] = []
     enough = min(_COMPARED, int(_LEAST_KNOWN * len(sightings)))
-    for factor in _FOCAL_STARTS if camera.focal_std else (1.0,):
+    for factor in (0.7, 1.0, 1.5) if camera.focal_std else (1.0,):  # on the focal length of an unknown lens
         matrix = with_focal(camera.matrix, factor)
         for pair in candidate_pairs(sightings, matrix, key_hz):
             start = begin(sightings, pair, matrix)
@@ -192,5 +184,6 @@ def _at_frames(values: np.ndarray, frames: int) -> np.ndarray:
 
 def fits(found: AdjustedPath, matrix: np.ndarray) -> bool:
     """Whether a path explains the points that it was adjusted by."""
-    near = found.residual_px < _LARGEST_PX * matrix[0, 2] * 2 / 1280.0
-    return bool(near and np.mean(found.weight > 0.25) > _LEAST_FITTING)
+    near = found.residual_px < 2.5 * matrix[0, 2] * 2 / 1280.0  # 2.5 px of an image 1280 wide
+    # Where fewer observations fit, what moves outnumbers what stands.
+    return bool(near and np.mean(found.weight > 0.25) > 0.4)

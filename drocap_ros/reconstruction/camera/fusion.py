@@ -41,16 +41,8 @@ _OVERLAP = 240
 _WIDE = CameraErrors(tilt_deg=1.0, position_wander_m=0.5, attitude_wander_deg=0.3)
 #: Time (s) over which the found errors tell how far they wander.
 _LAG_S = 4.0
-#: Found errors over the configured ones, from which the configuration does not hold.
-_OTHER = 1.5
 #: Share of the frames with enough points, below which the points do not tell the path.
 _LEAST_COVERED = 0.5
-#: Slow errors (degrees) of a reported turn above which it is another flight's: a gimbal's yaw that jumps by 9 degrees,
-#: the largest jump that is not refused as one, has 3; logs of other flights had 17 to 57.
-_LARGEST_TURN_DEG = 10.0
-#: Latency (s) from which the reports are shifted, and the largest share of it that its standard deviation may be.
-_LONG_S = 0.02
-_SURE = 0.2
 
 
 class Fusion(NamedTuple):
@@ -165,7 +157,8 @@ def _adjusted(data: PathInput) -> AdjustedPath | Refusal | None:
         attitude_deg / own.attitude_wander_deg,
         0.5 * tilt_deg / own.tilt_deg,  # two standard deviations of a constant are no exception
     )
-    if wide := max(over) >= _OTHER:
+    # From one and a half times the configured errors on, the configuration does not hold.
+    if wide := max(over) >= 1.5:
         position_m = max(position_m, _WIDE.position_wander_m)
         own = replace(
             own,
@@ -182,7 +175,9 @@ def _adjusted(data: PathInput) -> AdjustedPath | Refusal | None:
     if not wide:
         return _without_latency(data, found)
     left_deg = _wander(found.state, given, own)[1]
-    if left_deg > _LARGEST_TURN_DEG and found.covered >= _LEAST_COVERED:
+    # Another flight's: a gimbal's yaw that jumps by 9 degrees, the largest jump that is not refused as one, leaves 3;
+    # logs of other flights left 17 to 57.
+    if left_deg > 10.0 and found.covered >= _LEAST_COVERED:
         return Refusal(Why.POINTS_TURN_OTHERWISE, left_deg)
     return _in_its_place(_without_latency(data, found), own, given)
 
@@ -209,7 +204,8 @@ def _without_latency(data: PathInput, found: AdjustedPath) -> AdjustedPath:
     """
     latencies = found.shared[[ATTITUDE_LATENCY, POSITION_LATENCY]]
     std = found.shared_std[[ATTITUDE_LATENCY, POSITION_LATENCY]]
-    if np.abs(latencies).max() < _LONG_S or not (std < _SURE * np.abs(latencies).max()).all():
+    # Reports are shifted by latencies from 20 ms on that are known to a fifth.
+    if np.abs(latencies).max() < 0.02 or not (std < 0.2 * np.abs(latencies).max()).all():
         return found
     later = at_other_time(data.path, *latencies.tolist())
     shared = found.state.shared.copy()

@@ -18,15 +18,8 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 
 #: Distance (px) of a point from its projection within which it agrees with a pose.
 AGREES_PX = 4.0
-#: Points that agree, at least, and share of them.
+#: Points that agree, at least.
 LEAST_POINTS = 10
-_LEAST_SHARE = 0.4
-#: Most steps from the expected pose, and the square over the median one at which a point has half its weight.
-_STEPS = 12
-_OVER_MEDIAN = 4.0
-#: Least depth of a point over the median one, and change of the residuals' median (px) that ends the steps.
-_NEAREST = 0.01
-_CONVERGED_PX = 0.01
 
 
 def resected(
@@ -37,18 +30,20 @@ def resected(
     Robust Gauss-Newton steps from the expected ``rotation`` and ``position``.
     """
     focal, before = np.diagonal(matrix)[:2], np.inf
-    for _ in range(_STEPS):
+    for _ in range(12):  # steps at most
         seen = (places - position) @ rotation.T
         x, y, z = seen.T
-        z = np.maximum(z, _NEAREST * float(np.median(np.abs(z))) + 1e-12)
+        # No point is nearer than a hundredth of the median depth.
+        z = np.maximum(z, 0.01 * float(np.median(np.abs(z))) + 1e-12)
         slope = seen[:, :2] / z[:, None]
         rest = focal * slope + matrix[:2, 2] - pixels
         square = np.square(rest).sum(axis=1)
         usual = float(np.median(square))
-        if abs(before - np.sqrt(usual)) < _CONVERGED_PX:
+        if abs(before - np.sqrt(usual)) < 0.01:  # px
             break
         before = float(np.sqrt(usual))
-        weight = 1.0 / (1.0 + square / max(AGREES_PX**2, _OVER_MEDIAN * usual))
+        # A point has half its weight at twice the median residual.
+        weight = 1.0 / (1.0 + square / max(AGREES_PX**2, 4.0 * usual))
         # Rows of u and v: by the position, then by a turn in camera axes, as in ``path_residuals``.
         per_unit = (weight / z)[:, None] * focal
         rows = np.empty((len(places), 2, 6))
@@ -64,15 +59,9 @@ def resected(
             return None
         position, rotation = position + step[:3], exp_so3(step[3:]) @ rotation
     agree = (square < AGREES_PX**2) & (seen[:, 2] > 0.0)
-    return (rotation, position) if agree.sum() >= max(LEAST_POINTS, _LEAST_SHARE * len(places)) else None
+    return (rotation, position) if agree.sum() >= max(LEAST_POINTS, 0.4 * len(places)) else None
 
 
-#: Times (s) between the keyframes of a pair, and how many places of a recording are tried.
-_PAIR_S = (0.5, 1.0, 2.0, 3.0)
-_PLACES = 12
-#: Points that both keyframes of a pair see, at least, and pairs that are tried.
-_LEAST_COMMON = 16
-_PAIRS = 3
 #: Parallax (rad) above which more helps no pair, and from which a camera does not move little: six degrees.
 ENOUGH_PARALLAX = 0.1
 
@@ -89,13 +78,14 @@ class Pair(NamedTuple):
 def candidate_pairs(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> list[Pair]:
     """Pairs with much parallax and many common points, best first."""
     found: list[Pair] = []
-    for lag_s in _PAIR_S:
+    for lag_s in (0.5, 1.0, 2.0, 3.0):  # between the keyframes of a pair
         lag = max(round(lag_s * key_hz), 1)
         if lag >= len(sightings):
             continue
-        for first in np.unique(np.linspace(0, len(sightings) - 1 - lag, _PLACES).astype(int)).tolist():
+        # At twelve places of a recording.
+        for first in np.unique(np.linspace(0, len(sightings) - 1 - lag, 12).astype(int)).tolist():
             both = sightings.common(first, first + lag)
-            if both.shape[1] < _LEAST_COMMON:
+            if both.shape[1] < 16:
                 continue
             _, angle = turn_between(both, matrix)
             # Far points have no parallax: the percentile is that of the nearer points.
@@ -107,22 +97,13 @@ def candidate_pairs(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> 
     for pair in found:
         if all(abs(pair.first - other.first) > key_hz for other in apart):
             apart.append(pair)
-    return apart[:_PAIRS]
+    return apart[:3]
 
 
 #: Distance (px) of a point from its epipolar line or its projection within which it supports a camera.
 _INLIER_PX = 2.0
 #: Steps of an adjustment while the path grows, and of the last one.
 LAST_STEPS = 12
-#: Keyframes after which the first adjustment runs, and their growth until the next one.
-_FIRST_KEYS = 12
-_GROWTH = 1.6
-#: Acceleration (heights of the camera per s^2) of a camera that moves little, and steps of its adjustment.
-_SMALL_ACCELERATION = 0.3
-_SMALL_STEPS = 25
-#: Angle (degrees) of the ground from the usual image's horizontal, and distance of its points over the camera's height.
-_TILTED_DEG = 60.0
-_FARTHEST_GROUND = 20.0
 
 
 @dataclass(frozen=True)
@@ -168,11 +149,12 @@ class Growth:
 
     def grow(self, most: int) -> Grown:
         """Place keyframes on both sides until ``most`` are known or no more can be placed; adjust now and then."""
-        due = _FIRST_KEYS
+        # Keyframes at the first adjustment, then their growth until the next one.
+        due = 12
         while int(self.path.known.sum()) < most and self.extend():
             if self.path.known.sum() >= due:
                 self.adjust()
-                due = int(_GROWTH * self.path.known.sum())
+                due = int(1.6 * self.path.known.sum())
         if self.path.known.sum() > 2:
             self.adjust()
         return self.path
@@ -209,12 +191,14 @@ class Growth:
         """
         known, flat = self.path.known, self._flat
         up = -self.path.rotation[known, 1].mean(axis=0)
-        ground = largest_plane(self.places[self.usable & ~flat], self.path.position[known], up, _TILTED_DEG)
+        # The usual image's horizontal may lean against the ground by 60 degrees.
+        ground = largest_plane(self.places[self.usable & ~flat], self.path.position[known], up, 60.0)
         if ground is None:
             return False
         normal, level = ground
         height, falls = self._eye @ normal - level, -self._ray @ normal
-        lying = (self._count > 0) & flat & (height > 0.0) & (falls > 1.0 / _FARTHEST_GROUND)
+        # Ground counts up to 20 heights of the camera away.
+        lying = (self._count > 0) & flat & (height > 0.0) & (falls > 1.0 / 20.0)
         away = (height[lying] / falls[lying])[:, None]
         # Rays from one place meet there: other points without depth would hold the camera fast.
         self.places[lying], self.usable[flat] = self._eye[lying] + away * self._ray[lying], lying[flat]
@@ -370,7 +354,8 @@ def small_motion(
     begin with, only depths that are about right.
     """
     path = CameraTelemetry(*turns(sightings, matrix), fps)
-    config = replace(free_config(1.0, focal_std, _SMALL_ACCELERATION), iterations=_SMALL_STEPS)
+    # An acceleration of 0.3 heights of the camera per s^2: it moves little.
+    config = replace(free_config(1.0, focal_std, 0.3), iterations=25)
     return adjust_path(PathInput(path, matrix, sightings.views, config), horizon=horizon)
 
 

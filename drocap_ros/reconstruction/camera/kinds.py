@@ -14,10 +14,6 @@ from drocap_ros.geometry.rotations import exp_so3, project_to_so3
 from drocap_ros.reconstruction.camera.path_model import Views
 from drocap_ros.tracks import Tracks
 
-#: Steps of reweighting of a turn, and the least scale (rad) of its residuals: a tenth of a pixel.
-_TURN_STEPS = 8
-_LEAST_ANGLE = 1e-4
-
 
 class Sightings:
     """Views (of pieces of tracks) at keyframes (K,), frames in ascending order."""
@@ -66,22 +62,16 @@ def rays(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def turn_between(both: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) of a camera between two views (2, N, 2) px, robust, and the angles (N,) rad that it leaves."""
     (first, second), weight = (rays(points, matrix) for points in both), np.ones(both.shape[1])
-    for _ in range(_TURN_STEPS):
+    for _ in range(8):  # steps of reweighting
         rotation = project_to_so3((weight[:, None] * second).T @ first)
         angle = np.linalg.norm(second - first @ rotation.T, axis=1)
-        weight = 1.0 / (1.0 + np.square(angle / max(float(np.median(angle)), _LEAST_ANGLE))) ** 2
+        # The residuals' scale is a tenth of a pixel at least, in rad.
+        weight = 1.0 / (1.0 + np.square(angle / max(float(np.median(angle)), 1e-4))) ** 2
     return rotation, angle
 
 
 #: Points with which an image tells.
 _LEAST_POINTS = 12
-#: Share of the points that goes on over a cut, at most: some corners of the new image look like those of the old one.
-_GOES_ON = 0.05
-#: Logarithm of the factor by which an image grows or shrinks at once where a cut leads to a nearer or farther view of
-#: the same scene, and how many times that between the images beside: clips of drones and hands, with 5 to 60 images a
-#: second, have up to 0.04, and that steadily.
-_GROWS = 0.05
-_AT_ONCE = 4.0
 
 
 def cut_times(tracks: Tracks) -> list[float]:
@@ -103,12 +93,15 @@ def cuts(points: Background, time_s: np.ndarray) -> list[int]:
     compared = [_compared(points, rows[before], rows[after]) for before, after in pairs]
     growth = np.array([0.0, *(grown for _, grown in compared), 0.0])
     beside = np.maximum(growth[:-2], growth[2:])
-    jumps = growth[1:-1] > np.maximum(_GROWS, _AT_ONCE * beside)
-    # Longest time (s) without points that counts as a cut: a fade; later no point could go on anyway.
+    # A cut to a nearer or farther view of the same scene grows or shrinks at once; the logarithm of the factor is up to
+    # 0.04 in clips of drones and hands, with 5 to 60 images a second, and that steadily.
+    jumps = growth[1:-1] > np.maximum(0.05, 4.0 * beside)
+    # Longest time (s) without points that counts as a cut: a fade; later no point could go on anyway.  Over a cut a few
+    # corners of the new image look like those of the old one.
     return [
         before + 1
         for (before, after), (share, _), jump in zip(pairs, compared, jumps, strict=True)
-        if (share < _GOES_ON or jump) and time_s[after] - time_s[before] <= 0.5
+        if (share < 0.05 or jump) and time_s[after] - time_s[before] <= 0.5
     ]
 
 
@@ -126,24 +119,10 @@ def _compared(points: Background, before: np.ndarray, after: np.ndarray) -> tupl
     return share, float(np.abs(np.median(np.log(second / first))))
 
 
-#: Times (s) between the keyframes that are compared, and most pairs of each.
-_LAGS_S = (1.0, 3.0)
-_PAIRS = 30
 #: Points that a pair has at least.
 _LEAST_COMMON = 12
-#: Motion (px of an image 1280 wide) of points before a camera that stands, or that a turn does not explain: errors of
-#: tracks reach half of it.
-_SAME_PX = 1.0
-_REFERENCE_WIDTH = 1280.0
-#: Change of the focal length from which a camera zooms, and steps to find it.
-_ZOOM = 0.01
-_ZOOM_STEPS = 6
-#: Factors on the focal length that are tried for a camera that turns: least, largest, how many.
-_FOCALS = (0.5, 2.0, 9)
 #: Share of pairs that have to agree.
 _MOST = 0.8
-#: Share of keyframes that see enough points, at least.
-_SEEING = 0.5
 
 
 def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int) -> Kind:
@@ -152,9 +131,9 @@ def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int)
         return Kind.CUT
     seeing = np.mean([len(rows) >= _LEAST_COMMON for rows in sightings.rows])
     pairs = _pairs(sightings, key_hz)
-    if seeing < _SEEING or not pairs:
+    if seeing < 0.5 or not pairs:  # half of the keyframes see enough points
         return Kind.FEW_POINTS
-    same = _SAME_PX * width / _REFERENCE_WIDTH
+    same = width / 1280.0  # px: errors of tracks reach half of it
     # First, as turns and zooms take nearly all of the time: a camera on a tripod is asked in each live window.
     way = np.array([np.median(np.linalg.norm(there - here, axis=1)) for here, there in pairs])
     if np.mean(way < same) >= _MOST and np.mean(way < 2 * same) >= 0.5 * (1.0 + _MOST):
@@ -164,7 +143,7 @@ def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int)
         # What no turn explains either is the tracks' errors: of small images, or behind persons who pass.
         explains = turned[way >= same] < 0.5 * way[way >= same]
         return Kind.TURNS if explains.mean() > 0.5 else Kind.STANDS
-    zooms = (zoomed < same) & (np.abs(zoom) > _ZOOM)
+    zooms = (zoomed < same) & (np.abs(zoom) > 0.01)  # of the focal length
     if zooms.any() and np.mean(zoomed < same) >= _MOST:
         return Kind.ZOOMS
     return Kind.MOVES
@@ -186,7 +165,7 @@ def cut_at(sightings: Sightings, over_gaps: bool = False) -> int | None:
 
 def turning_focal(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> float:
     """Factor on the focal length at which turns explain the points best; for a camera that turns in its place."""
-    factors = np.geomspace(*_FOCALS)
+    factors = np.geomspace(0.5, 2.0, 9)
     pairs = _pairs(sightings, key_hz)
     rest = [float(np.median(_motion(pairs, with_focal(matrix, factor))[0])) for factor in factors]
     return float(factors[int(np.argmin(rest))])
@@ -200,12 +179,12 @@ def _motion(pairs: list[np.ndarray], matrix: np.ndarray) -> np.ndarray:
 def _pairs(sightings: Sightings, key_hz: float) -> list[np.ndarray]:
     """Points (2, N, 2) px that pairs of keyframes have in common."""
     found = []
-    for lag_s in _LAGS_S:
+    for lag_s in (1.0, 3.0):  # between the keyframes of a pair, of which at most 30 are compared
         lag = max(round(lag_s * key_hz), 1)
         last = len(sightings) - 1 - lag
         if last < 0:
             continue
-        for first in np.unique(np.linspace(0, last, _PAIRS).astype(int)).tolist():
+        for first in np.unique(np.linspace(0, last, 30).astype(int)).tolist():
             both = sightings.common(first, first + lag)
             if both.shape[1] >= _LEAST_COMMON:
                 found.append(both)
@@ -223,7 +202,7 @@ def _compare(both: np.ndarray, matrix: np.ndarray) -> tuple[float, float, float]
 def _turn_and_zoom(expected: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
     """Zoom that with a further turn maps directions (N, 3) to places (N, 2), and the median of what remains."""
     zoom, weight = 1.0, np.ones(len(seen))
-    for _ in range(_ZOOM_STEPS):
+    for _ in range(6):
         x, y = (expected[:, :2] / np.maximum(expected[:, 2:], 0.1)).T
         rest = seen - zoom * np.stack([x, y], axis=1)
         by_x = np.stack([-x * y * zoom, (1 + x * x) * zoom, -y * zoom, x], axis=1)

@@ -126,15 +126,8 @@ def _by_shared(r: PathResiduals) -> np.ndarray:
 
 #: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 5e-4
-#: Damping of the first step, as a share of the diagonal, and the least one after a step that raises the cost.
-_FIRST_DAMPING = 1e-3
-_LEAST_DAMPING = 1e-6
-#: Range of the first nearness (1 / distance) of points of ground, in heights of the camera.
-_NEARNESS = (0.03, 2.0)
 #: Tangent of the angle from the image's middle up to the horizon, of a camera that looks down by 15 degrees.
 _HORIZON = 0.26
-#: Most dampings that are tried for one step.
-_TRIALS = 8
 #: Points in a frame below which its camera is the neighbours' alone.
 ENOUGH_POINTS = 8
 
@@ -188,7 +181,7 @@ def initial_state(data: PathInput, horizon: float = _HORIZON) -> PathState:
         # a small motion to the turns, and its sign open.
         below = (data.views.point[:, 1] - data.matrix[1, 2]) / data.matrix[1, 1]
         lower = data.views.of_pieces(below) / np.bincount(data.views.piece)
-        points[:, 3] = np.clip(horizon + lower, *_NEARNESS)
+        points[:, 3] = np.clip(horizon + lower, 0.03, 2.0)  # 1 / distance in heights of the camera
         points, unit = points / np.linalg.norm(points, axis=1, keepdims=True), 1.0
     return PathState(np.zeros((data.knots.count, KNOT)), np.zeros((path.frames, KNOT)), np.zeros(SHARED), points, unit)
 
@@ -233,7 +226,7 @@ def improved_path(
     """
     state = initial_state(data, horizon) if start is None else replace(start, rest=np.zeros_like(start.rest))
     here = PathResiduals(data, weights_of(data), state, OUTLIER_SQUARE)
-    stop, done, damping = ITERATIONS, 0, _FIRST_DAMPING
+    stop, done, damping = ITERATIONS, 0, 1e-3  # a share of the diagonal
     for _ in range(data.config.iterations):
         done += 1
         before = here.outlier
@@ -255,13 +248,13 @@ def _improved(here: PathResiduals, damping: float) -> tuple[PathResiduals | None
     Levenberg-Marquardt: without damping the whole path would turn far on, as only the priors hold it.
     """
     equations = PathEquations(here)
-    for _ in range(_TRIALS):
+    for _ in range(8):
         step = equations.step(damping)
         if step is not None:
             there = with_points(here.moved(*step))
             if there.cost <= here.cost:
                 return there, 0.1 * damping
-        damping = 10.0 * max(damping, _LEAST_DAMPING)
+        damping = 10.0 * max(damping, 1e-6)
     return None, damping
 
 

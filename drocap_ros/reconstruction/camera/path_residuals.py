@@ -35,16 +35,13 @@ from drocap_ros.reconstruction.common.engine import (
     add_second_difference,
     pull_second_difference,
     second_difference,
+    usual_outlier,
 )
 
 #: Squared residual, in standard deviations, at which a point has half its weight: three of them, as for joints.
 OUTLIER_SQUARE = 9.0
-#: The same over the median square, while all residuals are large.
-_OVER_MEDIAN = 4.0
 #: Least depth of a point over its distance from the origin, in the path's unit.
 _NEAREST = 1e-3
-#: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
-_OWN_LATENCY = 0.2
 
 
 class PathWeights(NamedTuple):
@@ -93,8 +90,7 @@ def expected_shared(config: CameraErrors, axes: np.ndarray, focal: float = 0.0) 
     covariance = np.zeros((SHARED, SHARED))
     covariance[MISALIGNMENT, MISALIGNMENT] = axes.T @ np.diag(turned**2) @ axes
     latencies = slice(ATTITUDE_LATENCY, POSITION_LATENCY + 1)
-    own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
-    covariance[latencies, latencies] = config.latency_s**2 * own
+    covariance[latencies, latencies] = config.latency_covariance
     covariance[FOCAL, FOCAL] = focal**2
     free, shared = np.zeros(SHARED, bool), np.zeros((SHARED, SHARED))
     free[MISALIGNMENT] = min(config.tilt_deg, config.yaw_deg) > 0.0
@@ -166,7 +162,7 @@ class PathResiduals:
 
     def usual_outlier(self) -> float:
         """Squared residual that sets outliers apart from the rest: far from the solution all are large."""
-        return max(OUTLIER_SQUARE, _OVER_MEDIAN * float(np.median(self.square))) if len(self.square) else OUTLIER_SQUARE
+        return usual_outlier(self.square, OUTLIER_SQUARE)
 
     @cached_property
     def _by_place(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -18,9 +18,6 @@ from drocap_ros.reconstruction.world.placement import ScaleEstimate, estimate_sc
 from drocap_ros.reconstruction.world.world_model import SIZE_STD
 from drocap_ros.skeleton import BODY_17
 
-#: Planes through three points that are tried, and distance of a point on one over the camera's height above it.
-_PLANES = 1000
-_ON_PLANE = 0.03
 #: Points on the plane, at least, and share of all.
 LEAST_ON_PLANE = 20
 LEAST_SHARE = 0.15
@@ -38,7 +35,7 @@ def largest_plane(
     if len(places) < LEAST_ON_PLANE:
         return None
     rng = np.random.default_rng(0)
-    corners = places[rng.integers(len(places), size=(_PLANES, 3))]
+    corners = places[rng.integers(len(places), size=(1000, 3))]  # planes that are tried
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     normal *= np.sign(normal @ up)[:, None]
@@ -48,7 +45,8 @@ def largest_plane(
     if not usual.any():
         return None
     normal, level, height = normal[usual], level[usual], height[usual]
-    on = (np.abs(places @ normal.T - level) < _ON_PLANE * height).sum(axis=0)
+    # A point on the plane is off it by 3 % of the camera's height.
+    on = (np.abs(places @ normal.T - level) < 0.03 * height).sum(axis=0)
     best = int(on.argmax())
     if on[best] < max(LEAST_ON_PLANE, LEAST_SHARE * len(places)):
         return None
@@ -58,9 +56,6 @@ def largest_plane(
 _PELVIS, _NECK = BODY_17.index("pelvis"), BODY_17.index("neck")
 #: Octaves about the first guess in which the factor of the path is sought.
 _OCTAVES = 6
-#: Share of feet that rest below which contacts give no scale, and its errors over its formal deviation.
-_LEAST_SUPPORT = 0.1
-_CONTACT_STDS = 3.0
 #: Deviation of the scale below which contacts measure it.
 FEET_TELL = 0.05
 #: Standard deviation (degrees) of the body's mean direction from the vertical: people lean, and the lifter does.
@@ -69,15 +64,10 @@ _BODY_STD_DEG = 3.0
 _LINE_STD_DEG = 1.0
 #: Standard deviation (m) of a resting foot's height, and independent ones per second: a foot rests for half a second.
 _FOOT_STD_M = 0.15
-#: Size (m) of a place: a foot's length.
-_PLACE_M = 0.6
 FEET_HZ = 2.0
 #: The same of a point of the ground, and distance (m) from the feet up to which points count.
 _GROUND_STD_M = 0.1
 _GROUND_M = 15.0
-#: Times (s) between two places of a foot that rests, and error (m) of its place.
-_REST_S = 0.25
-_REST_M = 0.05
 #: Steps of reweighting.
 _STEPS = 10
 
@@ -172,12 +162,14 @@ def by_contacts(feet: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) ->
     way = float(np.linalg.norm(np.ptp(position, axis=0)))
     # A camera's way is about as long as its distance from the person.
     guess = float(np.median(np.linalg.norm(feet, axis=-1))) / way
-    best, support = None, _LEAST_SUPPORT
+    # Where fewer feet rest contacts give no scale.
+    best, support = None, 0.1
     for octave in range(-_OCTAVES, _OCTAVES + 1):
         unit = guess * 2.0**octave
         found = estimate_scale(feet, unit * position, stamp_ns)
         if found is not None and found.support > support:
-            best, support = replace(found, factor=unit / found.factor, std=_CONTACT_STDS * found.std), found.support
+            # Contacts err by three times their formal deviation.
+            best, support = replace(found, factor=unit / found.factor, std=3.0 * found.std), found.support
     return best
 
 
@@ -221,10 +213,11 @@ def body_up(joints: np.ndarray) -> tuple[np.ndarray, float]:
 
 def resting(feet: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
     """(F, 2) weight of feet (F, 2, 3) m that stay where they are for a while."""
-    lag = max(int(np.searchsorted(stamp_ns, stamp_ns[0] + round(_REST_S * 1e9))), 1)
+    lag = max(int(np.searchsorted(stamp_ns, stamp_ns[0] + round(0.25 * 1e9))), 1)
     rest = np.zeros(feet.shape[:2])
     if lag < len(feet):
-        stays = rest_likelihood(np.square(feet[lag:] - feet[:-lag]).sum(-1), _REST_M)
+        # The place of a foot that rests errs by 5 cm.
+        stays = rest_likelihood(np.square(feet[lag:] - feet[:-lag]).sum(-1), 0.05)
         rest[: len(stays)] = stays
         rest[lag:] = np.maximum(rest[lag:], stays)
     return rest
@@ -243,7 +236,8 @@ def _by_lines(plane: _Plane, normals: np.ndarray) -> _Plane:
 def _by_feet(prior: _Plane, feet: np.ndarray, stamp_ns: np.ndarray) -> _Plane:
     """The plane of resting feet; all rests on one place count once: what errs there errs every time."""
     weight, places = resting(feet, stamp_ns).reshape(-1), feet.reshape(-1, 3)
-    cells = np.floor(places @ _two_across(prior.up).T / _PLACE_M).astype(int)
+    # Rests within 0.6 m are on one place.
+    cells = np.floor(places @ _two_across(prior.up).T / 0.6).astype(int)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     rests = np.bincount(cell.reshape(-1), weight)
     return _fit(prior, places, weight / np.maximum(rests, 1.0)[cell.reshape(-1)], _FOOT_STD_M)

@@ -119,8 +119,12 @@ def blas_threads(count: int) -> Iterator[None]:
         yield
 
 
-#: Most points that are tried on the line of a step.
-_TRIALS = 10
+def usual_outlier(square: np.ndarray, least: float) -> float:
+    """Squared residual, in standard deviations, at which an observation has half its weight.
+
+    Far from the solution all are large: then it is twice the usual one.
+    """
+    return max(least, 4.0 * float(np.median(square))) if len(square) else least
 
 
 class Equations(NamedTuple):
@@ -193,13 +197,10 @@ def search_line(cost: float, slope: float, point_at: Callable[[float], _There | 
 
     slope : derivative of the cost along the step at its beginning
     point_at : point at a share of the step; None = not allowed
-
-    Returns
-    -------
-    None where ten points have a higher cost, one that is not finite, or are not allowed.
+    returns : None where ten points have a higher cost, one that is not finite, or are not allowed
     """
     share = 1.0
-    for _ in range(_TRIALS):
+    for _ in range(10):
         there = point_at(share)
         if there is not None and there.cost <= cost:
             return there

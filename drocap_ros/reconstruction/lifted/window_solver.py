@@ -38,10 +38,7 @@ def depth_signs(
     reach : (F, L) >= 0, depth difference of bone l without its sign
     depth, sigma : (F, L) the lifter's depth difference and its expected absolute error
     speed, acceleration : first and second difference of the depth per frame that cost as much as one sigma
-
-    Returns
-    -------
-    (F, L) of +1 and -1
+    returns : (F, L) of +1 and -1
     """
     frames, bones = reach.shape
     signs: np.ndarray = np.array([1.0, -1.0])

@@ -84,10 +84,8 @@ def _timed(poses: ImagePoses, initial_s: float, adjusting_s: float, dictionary: 
 def _initial_poses(data: MethodInput, dictionary: Dictionary) -> tuple[np.ndarray, np.ndarray]:
     """Single-view initializer over blocks of frames.
 
-    Returns
-    -------
-    poses (F, 15, 3) px in camera axes, centred
-    inlier (F, 15) in [0, 1]: probability of the last E-step that the 2D joint is no outlier
+    returns : poses (F, 15, 3) px in camera axes, centred; inlier (F, 15) in [0, 1]: probability of the last E-step
+        that the 2D joint is no outlier
     """
     keypoints, config = data.keypoints, data.initializer
     out = np.zeros((*keypoints.xy.shape[:2], 3))

@@ -36,9 +36,7 @@ def nuclear_norm(s: np.ndarray) -> float:
 def singular_value_threshold(s: np.ndarray, tau: float) -> tuple[np.ndarray, float]:
     """Proximal step of ``tau * nuclear norm`` (Cai, Candes and Shen 2010) on shapes (..., F).
 
-    Returns
-    -------
-    shapes (..., F) and the nuclear norm of the result
+    returns : shapes (..., F) and the nuclear norm of the result
     """
     m = s.reshape(-1, s.shape[-1])
     sigma, u, wide = _singular(m)
@@ -210,10 +208,7 @@ def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise.
 
     s : (3, P, F) initial shapes
-
-    Returns
-    -------
-    shapes (3, P, F), the cost (iterations + 1,) after each step, and why the solver stopped
+    returns : shapes (3, P, F), the cost (iterations + 1,) after each step, and why the solver stopped
     """
     config, alpha = objective.config, objective.alpha
     cost = objective.value(s) + alpha * nuclear_norm(s)
@@ -243,9 +238,7 @@ def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _proximal_step(objective: Objective, at: np.ndarray, mu: float) -> tuple[np.ndarray, float, float]:
     """Equation (4) from ``at``; mu doubles until the quadratic model bounds f from above.
 
-    Returns
-    -------
-    new shapes, their cost (2), mu
+    returns : new shapes, their cost (2), mu
     """
     value, gradient = objective.value_and_gradient(at)
     while True:

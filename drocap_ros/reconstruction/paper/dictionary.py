@@ -58,10 +58,7 @@ def normalize_poses(x: np.ndarray) -> np.ndarray:
     """MoCap poses in the dictionary's frame and scale.
 
     x : (N, 15, 3) joints of BODY_15, any right-handed frame and unit
-
-    Returns
-    -------
-    (N, 15, 3) m, torso frame, centred, limb lengths of a person of 1.70 m
+    returns : (N, 15, 3) m, torso frame, centred, limb lengths of a person of 1.70 m
     """
     scale = REFERENCE_STATURE_M * LIMBS_PER_STATURE / limb_lengths(x).sum(-1)
     shape, _ = to_torso_frame(x * scale[:, None, None])

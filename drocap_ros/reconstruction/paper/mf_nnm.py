@@ -36,10 +36,7 @@ def factorize(
     """Poses of one window by MF+NNM.
 
     w, information : (F, P, 2) and (F, P, 3), normalized; missing joints are interpolated for the factorization
-
-    Returns
-    -------
-    poses (F, P, 3) in camera axes, and what the solver did
+    returns : poses (F, P, 3) in camera axes, and what the solver did
     """
     if len(w) < MIN_IMAGES:
         raise InputError(

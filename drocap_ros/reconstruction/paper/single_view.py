@@ -17,10 +17,7 @@ def initialize(
 
     w : (F, P, 2) centred joints in units of their standard deviation, 0 where the information is 0
     information : (F, P, 3) of :func:`~drocap_ros.reconstruction.paper.reprojection.information_from`
-
-    Returns
-    -------
-    poses (F, P, 3) in camera axes and the unit of the joints; information (F, P, 3) after the last E-step
+    returns : poses (F, P, 3) in camera axes and the unit of the joints; information (F, P, 3) after the last E-step
     """
     measured = information
     dense = search_viewpoints(w, information, dictionary, config)

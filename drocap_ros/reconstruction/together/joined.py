@@ -24,8 +24,6 @@ from drocap_ros.reconstruction.together.view import View
 from drocap_ros.reconstruction.world.refine import RefinedWorld
 from drocap_ros.skeleton import BODY_17
 
-#: Least likeness of two motions of one person, as two views give them: right pairs have 0.9, others at most 0.8.
-_LEAST_LIKENESS = 0.45
 #: Distance of keypoints from the common body over that from their own (:func:`misfit`): right pairs have at most 1.9.
 _LARGEST_MISFIT = 2.5
 #: Distance (m) and turn (deg) between a person's places and views in two reported worlds that are the same one.
@@ -37,11 +35,9 @@ _SAME_WORLD = Placement(1.0, np.eye(3), np.zeros(3), 0.0)
 def join_views(solved: list[Solved], names: list[str]) -> list[Motion]:
     """One body from several recordings of one person, each solved alone.
 
-    Returns
-    -------
-    list
-        The common body as each recording's camera sees it, at the first one's images on its own clock, in the order of
-        the recordings; the first one's motion has all of its frames.  ``meta["together"]`` has times and places.
+    returns : the common body as each recording's camera sees it, at the first one's images on its own clock, in the
+        order of the recordings; the first one's motion has all of its frames.  ``meta["together"]`` has times and
+        places.
     """
     _refuse_copies(solved, names)
     views = [View.of(one, name) for one, name in zip(solved, names, strict=True)]
@@ -71,7 +67,8 @@ def _best_fit(home: View, view: View, name: str, to: str) -> tuple[TimeOffset, P
     if view is home:
         return TimeOffset(0.0, 1.0), _SAME_WORLD
     found = time_offsets(home.shown(), view.shown())
-    if not found or found[0].likeness < _LEAST_LIKENESS:
+    # Right pairs of motions of one person have a likeness of 0.9, others at most 0.8.
+    if not found or found[0].likeness < 0.45:
         alike = f"a likeness of {found[0].likeness:.2f} at the best time" if found else "none that is alike"
         raise InputError(
             f"{name}: expected the motion that {to} shows, for at least {LEAST_S:g} s, found {alike}; are both of the"

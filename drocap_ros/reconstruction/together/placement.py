@@ -16,9 +16,6 @@ _RATE_HZ = 10.0
 #: Standard deviations (s) of the averages of a camera's turn and place beside a body: a drone turns by 10 degrees in
 #: half a second, and its place needs the range, which errs for longer.
 _TURN_S, _PLACE_S = 0.5, 1.0
-#: Turn (deg) that nine in ten instants have at most, against the mean one, of cameras that stand: signs of depth that
-#: are wrong for a second turn a body by 5.
-_STANDS_DEG = 15.0
 
 
 class Placement(NamedTuple):
@@ -40,7 +37,8 @@ class Placement(NamedTuple):
             return False
         turn = self.rotation @ project_to_so3(self.rotation.sum(axis=0)).T
         angle = np.arccos(np.clip(0.5 * (np.trace(turn, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
-        return bool(np.percentile(np.degrees(angle), 90) > _STANDS_DEG)
+        # Beside cameras that stand, signs of depth that are wrong for a second turn a body by 5 degrees.
+        return bool(np.percentile(np.degrees(angle), 90) > 15.0)
 
 
 def place_view(first: View, second: View, offset_s: float, upright: bool) -> Placement:

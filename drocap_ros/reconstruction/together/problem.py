@@ -19,17 +19,11 @@ from drocap_ros.reconstruction.world.world_model import Doubt, WorldInput
 #: Errors of a place and an attitude that the bodies of single views give: their depths err by a tenth of the range, and
 #: a body that is turned a little looks as one that faces the camera: two phones 38 degrees apart seemed to be 20.
 _PLACED_M, _PLACED_DEG = 0.5, 15.0
-#: Deviation (rad) of a turn that all bodies of a view's lifter have in common, as its errors last.
-_LEAN = 0.15
-#: Most of them that is believed: of a receiver without corrections; more is another motion.
-_MOST_WANDER_M = 0.6
 #: Time (s) in which a slow error is measured, and its change in that time over its standard deviation: the path's
 #: errors of WorldResiduals have a time constant of 60 s.
 _CHANGE_S, _CHANGE = 5.0, 0.4
 #: Least error (m) of a place that is believed: that of the best receivers.
 _LEAST_PLACED_M = 0.02
-#: Adjustments, each from the times and places that the one before has measured, and the change that ends them.
-_ROUNDS, _SAME_S, _SAME_LENS = 5, 5e-4, 5e-3
 #: Weight of the body as single views have it, in a start from the rays of all: deviation (m) of a joint.
 _SINGLE_M = 0.3
 
@@ -52,7 +46,8 @@ class JoinedProblem:
 
     def solve(self) -> RefinedWorld:
         """Adjust body, cameras and times in turns."""
-        for _ in range(_ROUNDS):
+        # Each adjustment begins from the times and places that the one before has measured.
+        for _ in range(5):
             inputs = self.inputs()
             start = self._start(inputs) if self._joints is None else self._joints
             refined = self._adjust(inputs, start)
@@ -65,7 +60,7 @@ class JoinedProblem:
             self.offsets = [offset + more for offset, more in zip(self.offsets, change, strict=True)]
             self.offset_std = [std for _, std in late]
             self._doubts = [self._doubt(n, inputs, refined) for n in range(len(inputs))]
-            if max(map(abs, change)) < _SAME_S and max(map(abs, refined.lens)) < _SAME_LENS:
+            if max(map(abs, change)) < 5e-4 and max(map(abs, refined.lens)) < 5e-3:
                 break
         return refined
 
@@ -97,7 +92,8 @@ class JoinedProblem:
 
     def _first_doubt(self, number: int) -> Doubt:
         view = self.views[number]
-        doubt = Doubt(lens=(0.0, view.focal_std), lean_std=_LEAN)
+        # All bodies of a view's lifter have a turn (rad) in common, as its errors last.
+        doubt = Doubt(lens=(0.0, view.focal_std), lean_std=0.15)
         if number == self.home:
             return doubt
         # Slow errors of a path beside those that its own recording knows of, before they are measured.
@@ -128,7 +124,8 @@ class JoinedProblem:
         rows = np.flatnonzero(later < len(time))
         placed = _across(off)
         wander = _across(off[later[rows]] - off[rows]) / _CHANGE if len(rows) else doubt.wander_m
-        return doubt._replace(placed_m=max(placed, _LEAST_PLACED_M), wander_m=min(wander, _MOST_WANDER_M))
+        # A receiver without corrections wanders by 0.6 m; more is another motion.
+        return doubt._replace(placed_m=max(placed, _LEAST_PLACED_M), wander_m=min(wander, 0.6))
 
     def _start(self, inputs: list[WorldInput]) -> np.ndarray:
         """(F, 17, 3) m nearest to the rays of all views, and to the bodies of each."""

@@ -23,10 +23,6 @@ _WINDOW = 960
 _OVERLAP = 48
 #: Least noise (px) of a keypoint: no network is better.
 _LEAST_NOISE_PX = 0.5
-#: Share of the time in which an ankle has to be seen for the feet to tell wrong telemetry.
-_SEEN_SHARE = 0.3
-#: A part of a recording that is shorter may hold no step: its feet tell nothing.
-_FEET_S = 4.0
 
 
 class EvenCapture(NamedTuple):
@@ -103,14 +99,16 @@ def even_capture(camera: CameraPath, keypoints: Keypoints2D, poses: PlacedPoses,
 
 def capture_windows(capture: EvenCapture, feet: bool) -> list[CaptureWindow]:
     """Windows of all parts in order; ``feet`` : whether feet in contact keep their place."""
-    ankles, least = ankles_seen(capture.seen, capture.fps), min(len(capture.seen), _FEET_S * capture.fps)
+    # A shorter part may hold no step: its feet tell nothing.
+    ankles, least = ankles_seen(capture.seen, capture.fps), min(len(capture.seen), 4.0 * capture.fps)
     out = []
     for part in capture.parts:
         frames = part.stop - part.start
         for inside in windows(frames, _WINDOW, _OVERLAP):
             rows = slice(part.start + inside.start, part.start + inside.stop)
             share = float(ankles[rows].mean())
-            tells = feet and share > _SEEN_SHARE and rows.stop - rows.start >= least
+            # An ankle has to be seen for 0.3 of the time for the feet to tell wrong telemetry.
+            tells = feet and share > 0.3 and rows.stop - rows.start >= least
             fade = fade_weights(inside, frames, _OVERLAP)
             out.append(CaptureWindow(rows, fade, inside.start == 0, share, tells))
     return out

@@ -47,10 +47,7 @@ def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.n
     feet : (F, N, 3) m at the assumed scale, camera to foot, world axes
     camera_position : (F, 3) m, world axes
     stamp_ns : (F,)
-
-    Returns
-    -------
-    ScaleEstimate, or None when the camera moves too little or there are too few frames
+    returns : ScaleEstimate, or None when the camera moves too little or there are too few frames
     """
     gap, base = _pairs(feet, camera_position, stamp_ns)
     # Camera motion below a foot's uncertainty carries no information.

@@ -52,8 +52,6 @@ from drocap_ros.reconstruction.world.world_model import (
 
 #: Frames whose solution a live window takes over from the one before: two hold place and speed.
 _HELD = 2
-#: Cost of the telemetry per frame that no camera's flight explains.
-_LARGEST_COST = 100.0
 
 
 class Beside(NamedTuple):
@@ -275,7 +273,8 @@ class _Facts:
             self._contact = min(self._contact, contact / window.ankles_seen)
 
     def refusal(self) -> Refusal | None:
-        if not self._cost <= _LARGEST_COST:
+        # No camera's flight explains a cost of the telemetry of 100 per frame.
+        if not self._cost <= 100.0:
             return Refusal(Why.POSITION_JUMPS)
         # Least share of the time with a foot in contact: jogging has 0.2, a yaw off by 40 degrees less than 0.01.
         return Refusal(Why.NO_FOOT_RESTS) if self._contact < 0.03 else None

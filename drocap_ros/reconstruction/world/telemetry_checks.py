@@ -13,46 +13,22 @@ from drocap_ros.skeleton import BODY_15
 
 #: Time (s) for which the pose of a moving camera stays the same without a new measurement: reports come more often.
 _FROZEN_S = 1.0
-#: Median speed (m/s) of a camera that moves: a hover drifts more slowly.
-_MOVING_M_S = 0.2
 #: A vehicle stops and starts more slowly than this (m/s^2): gravity, by a tilt of 45 degrees.
 _STOP_M_S2 = 10.0
 #: Times (s) within which no gimbal turns by so much (degrees) and stands still, or turns evenly, before and after; 0 =
 #: one frame.  Simulated orbits at 15 frames per second reach 5.3 degrees in both.
 _TURNS_S_DEG = ((0.0, 10.0), (0.12, 12.0))
-#: Time (s) within which a position jumps and moves evenly before and after: two images, one between two states;
-_JUMP_S = 0.12
-#: and the least jump (m): resets of an estimator are larger.
-_JUMP_M = 0.5
-#: Largest error (s) of a log's time that is tried; a judgement;
+#: Largest error (s) of a log's time that is tried; a judgement.
 _SHIFTS_S = 3.0
-#: and the step (s) between two: half a step of walking.
-_SHIFT_STEP_S = 0.5
-#: Time (s) in which a foot on the ground stays: most of the half second for which a walker's foot stands;
-_LAG_S = 0.4
-#: that over which placed feet are averaged: one or two images of 24 Hz;
-_SMOOTHING_S = 0.06
-#: and the error (m) of their places: twice that of adjusted ones (metric_scale.py).
+#: Error (m) of the places of still feet: twice that of adjusted ones (metric_scale.py).
 _STILL_M = 2.0 * STILL_M
-#: Share of still feet at another time over that at the reported time: a judgement;
-_CLEARLY_BETTER = 1.8
-#: and its least value: fewer tell nothing.
-_LEAST_SHARE = 0.06
-#: Feet at rest on a true path are slower than the others by this factor.
-_RESTING_RATIO = 0.7
-#: Share of the time in which a foot has to look at rest to be judged.
-_RESTING_SHARE = 0.05
-#: Time (s) between the ends of the way of a foot that looks at rest; a judgement;
-_RESTING_LAG_S = 0.33
-#: and over which placed feet are averaged for it: two images of 24 Hz.
-_RESTING_SMOOTHING_S = 0.08
 
 
 def stops(rotation: np.ndarray, position: np.ndarray, fps: float) -> list[slice]:
     """Steps between poses (F, 3, 3), (F, 3) m that stay the same for a second, of a camera that moves otherwise."""
     same = unchanged(rotation, position)
     speed = np.linalg.norm(np.diff(position, axis=0), axis=-1) * fps
-    if same.all() or not float(np.median(speed[~same])) > _MOVING_M_S:
+    if same.all() or not float(np.median(speed[~same])) > 0.2:  # m/s: a hover drifts more slowly
         return []
     return [slice(begin, end) for begin, end in true_runs(same).tolist() if end - begin >= _FROZEN_S * fps]
 
@@ -89,11 +65,13 @@ def turned_at_once(rotation: np.ndarray, fps: float) -> Refusal | None:
 
 def jump_m(position: np.ndarray, fps: float) -> float:
     """Largest jump (m) of positions (F, 3) m, as by a reset of the estimate; 0 = none."""
-    lag = max(round(_JUMP_S * fps), 1)
+    # A position jumps, and moves evenly before and after, between two images, one between two states.
+    lag = max(round(0.12 * fps), 1)
     move = position[lag:] - position[:-lag]
     differs = np.linalg.norm(move[lag:] - move[:-lag], axis=1)
     jump = float(np.minimum(differs[:-lag], differs[lag:]).max(initial=0.0))
-    return jump if jump > max(_JUMP_M, _STOP_M_S2 * (lag / fps) ** 2) else 0.0
+    # Resets of an estimator are larger.
+    return jump if jump > max(0.5, _STOP_M_S2 * (lag / fps) ** 2) else 0.0
 
 
 def upside_down(joints: np.ndarray, rotation: np.ndarray) -> Refusal | None:
@@ -125,10 +103,11 @@ def stopped(rotation: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) ->
 def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, fps: float) -> Refusal | None:
     """Whether the feet of joints (F, 17, 3) m, placed by the poses, rest more often with poses of another time."""
     seen = (joints[:, ANKLES] - position[:, None]) @ np.swapaxes(rotation, 1, 2)
-    shifts = np.arange(-_SHIFTS_S, _SHIFTS_S + 1e-9, _SHIFT_STEP_S)
+    shifts = np.arange(-_SHIFTS_S, _SHIFTS_S + 1e-9, 0.5)  # half a step of walking apart
     share = np.array([_still_share(seen, rotation, position, round(shift * fps), fps) for shift in shifts])
     best, own = int(share.argmax()), float(share[len(shifts) // 2])
-    if share[best] < max(_CLEARLY_BETTER * own, _LEAST_SHARE):
+    # Nearly twice as many still feet, a judgement; fewer than 0.06 tell nothing.
+    if share[best] < max(1.8 * own, 0.06):
         return None
     return Refusal(Why.OTHER_TIME, float(shifts[best]))
 
@@ -140,17 +119,20 @@ def resting_feet_move(joints: np.ndarray, still: np.ndarray, fps: float) -> Refu
     """
     from scipy.ndimage import gaussian_filter1d
 
-    lag = max(round(_RESTING_LAG_S * fps), 1)
+    # Between the ends of the way of a foot that looks at rest; a judgement.
+    lag = max(round(0.33 * fps), 1)
     if len(joints) <= 2 * lag:
         return None
-    feet = gaussian_filter1d(joints[:, ANKLES], _RESTING_SMOOTHING_S * fps, axis=0, mode="nearest")
+    # Averaged over two images of 24 Hz.
+    feet = gaussian_filter1d(joints[:, ANKLES], 0.08 * fps, axis=0, mode="nearest")
     speed = np.linalg.norm(feet[lag:] - feet[:-lag], axis=-1) * fps / lag
     rests = still[lag // 2 :][: len(speed)]
     weight = np.where(rests > LOOKS_AT_REST, rests, 0.0)
-    if weight.mean() < _RESTING_SHARE:
+    if weight.mean() < 0.05:  # too few rests to judge
         return None
     resting, moving = _median(speed, weight), _median(speed, np.where(rests > LOOKS_AT_REST, 0.0, 1.0 - rests))
-    if not (resting > PLACED_REST_M_S and resting > _RESTING_RATIO * moving):
+    # On a true path feet at rest are slower than the others.
+    if not (resting > PLACED_REST_M_S and resting > 0.7 * moving):
         return None
     return Refusal(Why.RESTING_FEET_MOVE, resting)
 
@@ -166,12 +148,14 @@ def _still_share(seen: np.ndarray, rotation: np.ndarray, position: np.ndarray, l
     """Share of steps over a lag that end where they began, of points (F, 2, 3) m in camera axes; 0 = too few."""
     from scipy.ndimage import gaussian_filter1d
 
-    lag = max(round(_LAG_S * fps), 1)
+    # Most of the half second for which a walker's foot stands.
+    lag = max(round(0.4 * fps), 1)
     frames = len(seen) - abs(later)
     if frames < max(8 * lag, len(seen) // 2):
         return 0.0
     of, at = max(-later, 0), max(later, 0)
     placed = seen[of : of + frames] @ rotation[at : at + frames] + position[at : at + frames, None]
-    feet = gaussian_filter1d(placed, _SMOOTHING_S * fps, axis=0, mode="nearest")
+    # Averaged over one or two images of 24 Hz.
+    feet = gaussian_filter1d(placed, 0.06 * fps, axis=0, mode="nearest")
     square = np.square(feet[lag:] - feet[:-lag]).sum(-1)
     return float(rest_likelihood(square, _STILL_M).mean())

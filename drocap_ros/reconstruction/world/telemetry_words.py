@@ -8,15 +8,9 @@ from typing import Any
 
 from drocap_ros.reconstruction.world.world_model import MEASURED
 
-#: Standard deviations from zero at which a correction is stated: 95 of 100 errors of nothing are smaller.
-_CLEAR = 2.0
-#: Standard deviations from the assumed stature at which a measured one is doubtful: one person in 370 is.
-_UNLIKELY = 3.0
 #: Wander of the reported position (m) and attitude (degrees) that is stated: twice that of good telemetry.
 _WANDER_M = 0.1
 _WANDER_DEG = 0.2
-#: Share of the time in which points contradict the path that is stated.
-_CONTRADICTED = 0.02
 
 
 def telemetry_words(meta: Mapping[str, Any]) -> str:
@@ -103,7 +97,7 @@ def _points(windows: list[Mapping[str, Any]]) -> str:
         )
         if seen[key] > least
     ]
-    if (share := seen.get("contradicted_share", 0.0)) > _CONTRADICTED:
+    if (share := seen.get("contradicted_share", 0.0)) > 0.02:
         words += f"; for {100 * share:.0f} % of the time most lie elsewhere: they move, or the log is wrong there"
     if windows[0].get("causes"):  # the wander is what other terms take of that error
         return words
@@ -124,7 +118,8 @@ def _path(windows: list[Mapping[str, Any]]) -> str:
 
 def _correction(name: str, found: list[tuple[float, float]], unit: str) -> str:
     value, std = max(found, key=lambda v: abs(v[0]) / v[1])
-    return f"{name} corrected by {_size(value, std, unit)}" if abs(value) > _CLEAR * std else ""
+    # 95 of 100 errors of nothing are smaller than two standard deviations.
+    return f"{name} corrected by {_size(value, std, unit)}" if abs(value) > 2.0 * std else ""
 
 
 def _size(value: float, std: float, unit: str) -> str:
@@ -136,7 +131,8 @@ def _stature(windows: list[Mapping[str, Any]], height_m: float | None) -> str:
     """Whether a measured scale makes the person taller or shorter than people are expected to be."""
     off = [math.log(w["scale"]) / w["stature_std"] for w in windows if w["scale_std"] < MEASURED and "stature_std" in w]
     worst = max(off, key=abs, default=0.0)
-    if abs(worst) < _UNLIKELY:
+    # Three standard deviations: one person in 370.
+    if abs(worst) < 3.0:
         return ""
     size = max((w["scale"] for w in windows if w["scale_std"] < MEASURED), key=lambda v: abs(math.log(v)))
     person = "the assumed one" if height_m is None else f"the assumed {height_m:.2f} m"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian
-from drocap_ros.reconstruction.common.engine import pull_second_difference, second_difference
+from drocap_ros.reconstruction.common.engine import pull_second_difference, second_difference, usual_outlier
 from drocap_ros.reconstruction.lifted.adjustment import DEPTH_ROUNDING_MM
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.world.world_model import (
@@ -25,13 +25,9 @@ from drocap_ros.reconstruction.world.world_model import (
 
 #: Squared image residual, in standard deviations, at which a joint has half its weight.
 OUTLIER_SQUARE = LiftedConfig.outlier_square
-#: The same over the median square, while all residuals are large: two standard deviations of the usual joint.
-_OVER_MEDIAN = 4.0
 _DEPTH_ROUNDING_M = DEPTH_ROUNDING_MM / 1000.0
 #: Least depth (m) of a joint before the camera: no drone is nearer.
 _NEAREST_M = 0.3
-#: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
-_OWN_LATENCY = 0.2
 #: The shared unknowns of a camera, and their columns in its derivatives: a misalignment turns every frame.
 OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY, LENS, LEAN]
 CAMERA_COLUMNS = np.array([6, 3, 4, 5, 7, 8, 9, 10, 11])
@@ -77,8 +73,7 @@ def errors_precision(view: WorldInput) -> np.ndarray:
     turned = np.deg2rad([tilt, yaw, tilt])
     precision = np.zeros((8, 8))
     precision[:3, :3] = axes.T @ np.diag(turned**-2) @ axes
-    own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
-    precision[3:5, 3:5] = np.linalg.inv(errors.latency_s**2 * own)
+    precision[3:5, 3:5] = np.linalg.inv(errors.latency_covariance)
     # Deviation of the logarithm of a focal length that is known, and of a lean (rad) that is none.
     precision[5:, 5:] = np.diag(np.maximum([doubt.lens[1], doubt.lean_std, doubt.lean_std], 1e-6) ** -2)
     return precision
@@ -141,8 +136,7 @@ class ViewResiduals:
 
     def usual_outlier(self) -> float:
         """Squared residual that sets outliers apart from the rest: far from the solution all are large."""
-        weighed = self.square[self.data.weight > 0]
-        return max(OUTLIER_SQUARE, _OVER_MEDIAN * float(np.median(weighed))) if len(weighed) else OUTLIER_SQUARE
+        return usual_outlier(self.square[self.data.weight > 0], OUTLIER_SQUARE)
 
     @cached_property
     def image_derivatives(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -64,10 +64,6 @@ def posterior(equations: Equations, state: WorldState) -> tuple[np.ndarray, np.n
 
 #: Standard deviation (m/s) of the speed of feet in contact, step by step: at first the body slides; the last one stays.
 _CONTACT_SPEEDS_M_S = (0.6, 0.4, 0.3, 0.2, 0.15)
-#: Spread (m) of the heights of resting feet on level ground, as the body's errors leave it,
-_LEVEL_M = 0.025
-#: and on steps, a third of a stair's riser.
-_STEPS_M = 0.06
 #: Errors of the shared unknowns over their formal standard deviations, from the scale errors of 36 runs: contacts are
 #: chosen by the same data.
 _STD_FACTOR = 1.25
@@ -274,7 +270,8 @@ def _floor_std(spread: float) -> float:
     """Standard deviation (m) of the floor's term: tight on level ground, loose on steps or a slope."""
     if not np.isfinite(spread):
         return HEIGHT_STD_M
-    return max(_LEVEL_M, HEIGHT_STD_M * (spread / _STEPS_M) ** 2)
+    # The body's errors leave 25 mm on level ground; on steps heights spread by a third of a stair's riser.
+    return max(0.025, HEIGHT_STD_M * (spread / 0.06) ** 2)
 
 
 def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, at: np.ndarray) -> Findings:

@@ -48,10 +48,6 @@ _HEADS = ("nose", "head", "head_top", "left_eye", "right_eye", "left_ear", "righ
 _UNITS = np.geomspace(1.0, 12.0, 32)
 #: Degrees of freedom of the bones' distribution: few, so that a bad point counts little.
 _FREEDOM = 3.0
-#: Points of the twelve limbs and the head without which a frame tells nothing.
-_LEAST_SEEN = 6
-#: Frames by which an exchange is judged.
-_LEAST_FRAMES = 4
 #: Exchanges of joints: two of a side or of a kind, parts of both arms and legs, arms for legs, left for right.
 _LIMBS, _SIDES = (["shoulder", "elbow", "wrist"], ["hip", "knee", "ankle"]), "lr"
 _EXCHANGES = [
@@ -67,10 +63,6 @@ _EXCHANGES = [
 #: Greatest lead of an exchange, and least likelihood: for names that are stated, and for an order that is only likely.
 #: Of 150 takes of MoCap of every kind from up to 45 degrees above 2 % pass neither; of shuffled joints none passes.
 _MOST_LEAD, _LEAST = (0.12, 0.1), (0.3, 0.4)
-#: Difference of the logarithms of lengths of both sides, beyond which it takes off a share of the likelihood: a hand
-#: near the camera reaches it.
-_UNEVEN, _UNEVEN_SHARE = 0.6, 0.6
-_A_WHILE = 8  # frames that are looked at, with fewer of which this says nothing
 
 
 def limbs_of(names: Sequence[str]) -> dict[str, int]:
@@ -108,8 +100,9 @@ def is_no_body(xy: np.ndarray, names: Sequence[str], *, strict: bool = False) ->
     found = _likelihood(joints, spread)
     uneven = max((abs(np.log(_length(joints, "l", *bone) / _length(joints, "r", *bone))) for limb in _LIMBS
                   for bone in itertools.pairwise(limb)), default=0.0)  # fmt: skip
-    uneven = uneven if len(joints) >= _A_WHILE else 0.0
-    if found.mean() - _UNEVEN_SHARE * max(np.nan_to_num(uneven) - _UNEVEN, 0.0) < _LEAST[strict]:
+    uneven = uneven if len(joints) >= 8 else 0.0  # fewer frames say nothing of it
+    # Lengths of both sides that differ by more (logarithm) take off a share: a hand near the camera reaches it.
+    if found.mean() - 0.6 * max(np.nan_to_num(uneven) - 0.6, 0.0) < _LEAST[strict]:
         return True
     for pairs in _EXCHANGES:
         order = np.arange(len(_PLACES))
@@ -117,7 +110,7 @@ def is_no_body(xy: np.ndarray, names: Sequence[str], *, strict: bool = False) ->
             order[[_PLACES.index(a), _PLACES.index(b)]] = _PLACES.index(b), _PLACES.index(a)
         moved = order != np.arange(len(_PLACES))
         both = seen[:, moved].all(axis=1)  # without those the number of known bones would differ
-        if both.sum() >= min(_LEAST_FRAMES, len(both)):
+        if both.sum() >= min(4, len(both)):  # by so many frames an exchange is judged
             exchanged = _likelihood(joints[both][:, order], spread[both])
             known = (~(~seen[both] @ (_WEIGHTS != 0).T)).mean()  # where few bones are seen each counts more
             margin = _MOST_LEAD[strict] * (1 + 2 / both.sum()) / known  # one pose says less than many
@@ -130,7 +123,7 @@ def _limb_points(xy: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.n
     """Frames (F, P, 2) that show enough, and the points of limbs and head (F, 13, 2) in them."""
     places = limbs_of(names)
     seen = np.isfinite(xy[:, list(places.values())]).all(axis=2).sum(axis=1) if places else np.zeros(len(xy), int)
-    frames = xy[seen >= _LEAST_SEEN]
+    frames = xy[seen >= 6]  # of the twelve limbs and the head: fewer tell nothing
     # Frames that are looked at, even steps of all.
     frames = frames[:: max(1, len(frames) // 32)]
     joints = np.full((len(frames), len(_PLACES), 2), np.nan)

@@ -16,9 +16,6 @@ Label = str | int | float | None
 #: Seconds of a unit by the end of a time's name; without one the first that gives a video's rate.
 _UNITS = {"_s": 1.0, "_ms": 1e-3, "_us": 1e-6, "_ns": 1e-9}
 _RATES_HZ = (2.0, 1000.0)
-#: Frames of a recording, with fewer of which on average names say no recording.
-_LEAST_FRAMES = 4
-_TIME_DIGITS = 6  # before the last number, from which they are a date or a time
 
 
 def one_person(
@@ -56,8 +53,10 @@ def of_one_recording(labels: list[Label]) -> tuple[list[Label], str]:
     found: dict[str, list[Label]] = {}
     for name in names:
         found.setdefault(re.sub(r"\d+\D*$", "", name) if isinstance(name, str) else "", []).append(name)
-    times = any(sum(map(str.isdigit, Path(begin).name)) >= _TIME_DIGITS for begin in found)
-    if len(found) < 2 or len(found) > len(names) / _LEAST_FRAMES or times:  # else the names hold other numbers
+    # Six digits before the last number are a date or a time.
+    times = any(sum(map(str.isdigit, Path(begin).name)) >= 6 for begin in found)
+    # Recordings have at least four frames on average.
+    if len(found) < 2 or len(found) > len(names) / 4 or times:  # else the names hold other numbers
         return labels, ""
     best = max(found, key=lambda begin: len(found[begin]))
     there = ", ".join(f"{begin}* ({len(of)} frames)" for begin, of in found.items())

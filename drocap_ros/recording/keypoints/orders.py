@@ -106,10 +106,6 @@ def order_named(text: str, count: int) -> str:
     return found[0]
 
 
-#: Least lead of the likelihood over that of another order, and of the points upside down.
-_LEAD, _UPSIDE_LEAD = 0.25, 0.5
-
-
 def name_points(xy: np.ndarray, stated: Sequence[str], wanted: str | None, tool: str) -> tuple[tuple[str, ...], str]:
     """Names of points (F, P, 2), or of their first, and words on what was taken and is doubtful.
 
@@ -127,9 +123,10 @@ def name_points(xy: np.ndarray, stated: Sequence[str], wanted: str | None, tool:
         raise InputError(f"expected points with names, or {', '.join(map(str, counts()))} of them, found {count}")
     scores = sorted(((body_likelihood(xy, ORDERS[name]), name) for name in known), reverse=True)
     (best, name), others = scores[0], [s for s, other in scores[1:] if not _same_limbs(other, scores[0][1])]
-    if body_likelihood(xy * [1.0, -1.0], ORDERS[name]) > best + _UPSIDE_LEAD:
+    # Least leads of the likelihood over that of the points upside down, and of another order.
+    if body_likelihood(xy * [1.0, -1.0], ORDERS[name]) > best + 0.5:
         raise InputError(f"expected y downwards, found a person upside down (order {name}); turn y, or {_say(known)}")
-    if (others and best < others[0] + _LEAD) or is_no_body(xy, ORDERS[name], strict=True):
+    if (others and best < others[0] + 0.25) or is_no_body(xy, ORDERS[name], strict=True):
         raise InputError(
             f"expected the names of {count} joints, found none, and no known order that clearly makes a body of them;"
             f" name the joints in the file, or {_say(known)}"

@@ -158,10 +158,7 @@ class CommittedFile:
     ``write`` collects; ``commit`` writes the collected bytes.  If that fails (disk full), the file is cut back to the
     last commit: it never ends in half a chunk.
 
-    Raises
-    ------
-    FileExistsError
-        At construction, when the file exists.
+    raises FileExistsError : at construction, when the file exists
     """
 
     def __init__(self, path: Path) -> None:

@@ -31,8 +31,6 @@ from drocap_ros.recording.telemetry.log import (
 _LINE = 16384
 #: Rows: five hours at Airdata's ten a second.
 _MAX_ROWS = 200_000
-#: A later time than eleven days is damage.
-_LATEST_MS = 1e9
 _GIMBAL, _AIRCRAFT = ("gimbal pitch", "gimbal roll", "gimbal yaw"), ("pitch", "roll", "yaw")
 #: A column's title in lower case: its name, and its unit in brackets.
 _TITLE = re.compile(r"([^(\[]*[^(\[ ]) *(?:[(\[]([^)\]]*)[)\]])?")
@@ -107,7 +105,8 @@ class _Table:
             raise InputError(f"{path}: expected at most {_MAX_ROWS} rows, found more; cut the file")
         table: np.ndarray = np.array(rows, dtype=np.float64).reshape(-1, len(found))
         time_ms = table[:, self._names.index("time")]
-        table = table[(time_ms >= 0) & (time_ms < _LATEST_MS)]
+        # A later time than eleven days is damage.
+        table = table[(time_ms >= 0) & (time_ms < 1e9)]
         self._rows = table[np.unique(table[:, self._names.index("time")], return_index=True)[1]]
         if not len(self._rows):
             raise InputError(f"{path}: expected rows with a time, found none; export the flight again")

@@ -37,16 +37,11 @@ from drocap_ros.tracks import MAX_FRAMES
 _FORMAT = "djmd"
 #: Bytes of a message; known ones have some kilobytes.
 _MAX_MESSAGE = 1 << 18
-#: Messages from which the layout is found.
-_PROBED = 32
 _FIRST = 4  # the header stands in one of these
-#: Units of the file: angles in tenths of a degree, heights in mm; ExifTool's DJI tags.
+#: Unit of the file's angles, by ExifTool's DJI tags.
 _TENTH_DEG = 0.1
-_MM = 1e-3  # m; of the file's heights
 #: Digital zooms; others are another value at that place.
 _ZOOM_RANGE = (1.0, 60.0)
-#: Of an unknown schema: largest median turn of the gimbal from the nose, deg, whose yaw follows the aircraft's.
-_TURN_DEG = 90.0
 #: Ends of the columns of one message's numbers: gimbal 3, aircraft 3, quaternion 4, latitude, longitude, unit, two
 #: heights, zoom.
 _COLUMNS = (3, 6, 10, 13, 15, 16)
@@ -109,7 +104,7 @@ def _probe(path: Path, number: int) -> tuple[np.ndarray, list[Message]]:
         stamps.append(stamp_ns)
         if i % step == 0:
             probed.append(data)
-            if len(probed) >= 2 * _PROBED:
+            if len(probed) >= 64:  # the layout is found from at least half of them
                 probed, step = [*probed[:_FIRST], *probed[_FIRST::2]], 2 * step
     return np.array(stamps, np.int64), [message for data in probed if (message := _message(data)) is not None]
 
@@ -181,7 +176,7 @@ def _from_rows(
 ) -> TelemetryLog:
     name, model = schema
     gimbal, aircraft, quaternion, place, heights, zoom = np.split(rows, _COLUMNS[:-1], axis=1)
-    relative, absolute = heights.T * _MM
+    relative, absolute = heights.T * 1e-3  # mm
     above_takeoff = np.isfinite(relative).any()
     geodetic = _degrees(place, model)
     geodetic[:, 2] = relative if above_takeoff else absolute
@@ -209,8 +204,9 @@ def _check_unknown(path: Path, series: Series) -> None:
     roll = np.nanmedian(np.abs(series.gimbal[:, 1])) if np.isfinite(series.gimbal).any() else 0.0
     turn = np.abs((series.gimbal[:, 2] - series.aircraft[:, 2] + 180.0) % 360.0 - 180.0)
     away = np.nanmedian(turn) if np.isfinite(turn).any() else 0.0
-    # A gimbal keeps the camera level: a larger median roll, deg, is another field.
-    if roll > 45.0 or away > _TURN_DEG:
+    # A gimbal keeps the camera level, and its yaw follows the aircraft's: a larger median roll or turn from the nose,
+    # deg, is another field.
+    if roll > 45.0 or away > 90.0:
         raise InputError(
             f"{path}: expected a level gimbal that follows the aircraft at the places of known djmd schemas, found a"
             f" roll of {roll:.0f} deg and a turn of {away:.0f} deg; give a log beside the video with --telemetry"

@@ -78,8 +78,6 @@ def with_camera(
 ) -> tuple[Tracks, str]:
     """Tracks with the camera's pose at each image, and as text what is missing; see :func:`camera_poses`.
 
-    Parameters
-    ----------
     at_ns : (F,) times of the images by the clock of the vehicle's states
     """
     poses = camera_poses(vehicle, at_ns, mount_pitch_deg)
@@ -162,13 +160,8 @@ def at_stamps(known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, *,
 
 #: Largest magnitudes of pitch, roll and yaw, deg.
 _LIMITS_DEG = np.array([180.0, 180.0, 360.0])
-#: A turn, or a way, from one state to the next that no gimbal or drone makes.
-_TURN_DEG = 30.0
-_TURN_DEG_S = 360.0  # deg/s: twice what DJI's gimbals are specified to turn
-_STEP_M = 20.0  # m: a fix that is renewed moves a place by some metres
-_SPEED_M_S = 60.0  # m/s: beyond DJI's fastest drones, some 40 m/s
 #: Metres of a degree of latitude.
-_METRES_PER_DEG = 111_320.0
+METRES_PER_DEG = 111_320.0
 
 
 class Series(NamedTuple):
@@ -233,7 +226,8 @@ def _zero(angles: np.ndarray) -> bool:
 def _check_turns(path: Path, name: str, stamp_ns: np.ndarray, angles: np.ndarray) -> None:
     known = ~np.isnan(angles).any(axis=1)
     turns = np.abs((np.diff(angles[known], axis=0) + 180.0) % 360.0 - 180.0).max(axis=1, initial=0.0)
-    possible = _TURN_DEG + _TURN_DEG_S * np.diff(stamp_ns[known]) * 1e-9
+    # No gimbal turns farther from one state to the next: DJI's are specified to turn by half of 360 deg/s.
+    possible = 30.0 + 360.0 * np.diff(stamp_ns[known]) * 1e-9
     share = float(np.mean(turns > possible)) if len(turns) else 0.0
     # Largest share of such turns: angles jump where a gimbal is recentred.
     if share > 0.05:
@@ -246,9 +240,10 @@ def _check_path(path: Path, stamp_ns: np.ndarray, place: np.ndarray) -> None:
         return
     step = np.diff(place[known], axis=0)
     step[:, 1] = (step[:, 1] + 180.0) % 360.0 - 180.0
-    scale = np.array([_METRES_PER_DEG, _METRES_PER_DEG * np.cos(np.deg2rad(place[known][0, 0])), 1.0])
+    scale = np.array([METRES_PER_DEG, METRES_PER_DEG * np.cos(np.deg2rad(place[known][0, 0])), 1.0])
     way = np.linalg.norm(step * scale, axis=1)
-    jumps = way > _STEP_M + _SPEED_M_S * np.diff(stamp_ns[known]) * 1e-9
+    # No drone flies farther: DJI's fastest have some 40 m/s, and a fix that is renewed moves a place by some metres.
+    jumps = way > 20.0 + 60.0 * np.diff(stamp_ns[known]) * 1e-9
     if jumps.any():
         _refuse(path, "positions that a drone can fly", f"{jumps.sum()} jumps, the longest by {way.max():.0f} m")
 

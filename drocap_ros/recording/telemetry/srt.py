@@ -19,6 +19,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.telemetry.log import (
+    METRES_PER_DEG,
     Lack,
     Lens,
     LogFormat,
@@ -51,7 +52,6 @@ _GPS = re.compile(
 _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
 #: Place of take-off, and the distance from it, m.
 _DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*{_NUMBER}\s*m")
-_METRES_PER_DEG = 111_320.0  # of latitude
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
 _VIEWS_DEG = (5.0, 170.0)  # possible fields of view
 #: Horizontal field of view, deg.
@@ -130,7 +130,7 @@ def _latitude_first(places: np.ndarray, home: np.ndarray, plain: np.ndarray) -> 
         return bool((np.abs(longitude) <= 90).all())
     east, north = longitude - home[plain, 0], latitude - home[plain, 1]
     off = [
-        np.abs(_METRES_PER_DEG * np.hypot(dx * np.cos(np.deg2rad(at)), dy) - home[plain, 2])
+        np.abs(METRES_PER_DEG * np.hypot(dx * np.cos(np.deg2rad(at)), dy) - home[plain, 2])
         for dx, dy, at in ((east, north, latitude), (north, east, longitude))
     ]
     as_is, turned = (float(np.nansum(errors)) for errors in off)

@@ -36,8 +36,6 @@ _Data = dict[str, np.ndarray]
 #: Bytes before the first message; kinds of messages (https://docs.px4.io/main/en/dev_log/ulog_file_format.html).
 _HEAD_BYTES = 16
 _KINDS, _DATA = frozenset(bytes([kind]) for kind in b"FBIMPQARDLCSO"), ord("D")
-#: Messages that follow each other behind damage.
-_IN_TURN = 4
 _GPS = ("vehicle_gps_position", "sensor_gps")
 _GIMBAL = "gimbal_device_attitude_status"
 _TOPICS = ("vehicle_attitude", "vehicle_local_position", "vehicle_global_position", _GIMBAL, *_GPS)
@@ -102,7 +100,7 @@ def _whole_messages(data: bytes) -> tuple[bytes, bool]:
 
 def _follow(end_of: Callable[[int], int], place: int, end: int) -> bool:
     """Whether messages follow each other from a place on, or to the end."""
-    for _ in range(_IN_TURN):
+    for _ in range(4):  # behind damage
         if place == end:
             break
         place = end_of(place)

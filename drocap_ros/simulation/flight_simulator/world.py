@@ -21,12 +21,7 @@ from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 from drocap_ros.simulation.vehicle.mount import SimulatedMount
 from drocap_ros.skeleton import BODY_17
 
-#: Deceleration and lag of the simulated vehicle, by which the pilot lets go of the stick in time.
-_BRAKING_M_S2 = 1.45
-_LAG_S = 0.35  # s, of the simulated vehicle as well
-#: Time on the ground, and of the hover before the hand-over.
-_READY_S = 1.0
-_HOVER_S = 1.5  # s; a judgement
+_HOVER_S = 1.5  # before the hand-over; a judgement
 
 
 class PilotedCopter(SimulatedCopter):
@@ -93,14 +88,15 @@ class SimulatedPilot:
         if not self.handed_over:
             sight = self._aim - copter.body.position
             copter.mount.command(math.degrees(math.atan2(float(sight[2]), float(np.hypot(sight[0], sight[1])))))
-        if self.phase == PilotPhase.CHECKS and t_s >= _READY_S:
+        if self.phase == PilotPhase.CHECKS and t_s >= 1.0:  # on the ground
             copter.armed, copter.landed_state = True, mavlink.MAV_LANDED_STATE_TAKEOFF
             # Climb of the take-off.
             copter.stick = np.array([0.0, 0.0, 1.2])
             self._enter(PilotPhase.CLIMB, t_s)
         elif self.phase == PilotPhase.CLIMB:
             climb = float(copter.body.velocity[2])
-            if copter.body.position[2] + climb * (_LAG_S + climb / (2 * _BRAKING_M_S2)) >= self._height_m:
+            # By deceleration and lag of the simulated vehicle the pilot lets go of the stick in time.
+            if copter.body.position[2] + climb * (0.35 + climb / (2 * 1.45)) >= self._height_m:
                 copter.stick, copter.landed_state = np.zeros(3), mavlink.MAV_LANDED_STATE_IN_AIR
                 self._enter(PilotPhase.HOVER, t_s)
         elif self.phase == PilotPhase.HOVER and t_s - self._since_s >= _HOVER_S:

@@ -79,11 +79,8 @@ def rasterize(quadrics: Quadrics, matrix: np.ndarray, width: int, height: int, l
     matrix : (3, 3) px without skew, pixel centres at whole numbers
     width, height : px of the image
     light : (3,) unit, towards the light, in the camera's frame
-
-    Returns
-    -------
-    The part of the image with the surfaces; its light is the cosine between normal and light (-1 to 1).
-    None without a surface in view.
+    returns : the part of the image with the surfaces; its light is the cosine between normal and light (-1 to 1).
+        None without a surface in view.
     """
     focal, middle = np.diag(matrix)[:2], matrix[:2, 2]
     boxes, visible = _boxes(quadrics, focal, middle, width, height)

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Distance over which the fine pattern of the ground fades into the coarse one.
-_FADE_M = 14.0
 #: Corners of the octagon for a circle of radius 1.
 _CIRCLE = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
 
@@ -47,7 +45,8 @@ def _draw_ground_and_sky(
     far = cv2.blendLinear(far, np.full_like(far, np.clip(scene.horizon, 0, 255).astype(np.uint8)), clear, 1 - clear)
     # A longer focal length keeps the fine pattern to a larger distance.
     focal = max(0.5 * float(matrix[0, 0] + matrix[1, 1]), 1.0)
-    fine = cv2.resize(np.exp(-distance * np.float32(600 / (_FADE_M * focal))), (width, height))
+    # Over 14 m the fine pattern of the ground fades into the coarse one.
+    fine = cv2.resize(np.exp(-distance * np.float32(600 / (14.0 * focal))), (width, height))
     image = cv2.blendLinear(near, cv2.resize(far, (width, height)), fine, 1 - fine)
     sky = cv2.resize(_sky(scene, small_rise), (width, height))
     return np.asarray(cv2.copyTo(sky, (rise >= 0).view(np.uint8), image))
@@ -205,11 +204,6 @@ def draw_shadow(
 #: Side of the ground's repeating pattern, near and far; the haze hides the repetitions.
 NEAR_M = 24.0
 FAR_M = 480.0  # m: twenty near ones
-_NEAR_PX = 1024  # px of the pattern: 2.3 cm each, about one px of an image from 20 m
-_FAR_PX = 512  # px of the pattern: 0.9 m each; the haze hides finer ones
-#: Distances of trees and houses from the origin, beyond the person's path.
-_LEAST_M = 32.0
-_MOST_M = 95.0  # m; a judgement, as the least
 
 _GROUNDS = (  # base colour BGR, its variation, size of its patches in px of the pattern
     ((60, 115, 85), 22.0, 40),  # grass
@@ -264,14 +258,14 @@ def make_scenery(seed: int) -> Scenery:
     horizon, zenith, sunlight = _SKIES[rng.integers(len(_SKIES))]
     height, bearing = np.deg2rad(rng.uniform(25, 70)), rng.uniform(-np.pi, np.pi)
     sun = np.array([np.cos(height) * np.cos(bearing), np.cos(height) * np.sin(bearing), np.sin(height)])
-    near = _pattern(rng, _NEAR_PX, colour, contrast, patch)
+    near = _pattern(rng, 1024, colour, contrast, patch)  # 2.3 cm a px: about one px of an image from 20 m
     _paint_lines(rng, near)
     houses, house_colours = _houses(rng, int(rng.integers(2, 9)))
     trees, tree_colours = _trees(rng, int(rng.integers(6, 26)))
     far_colour = near.reshape(-1, 3).mean(axis=0)
     return Scenery(
         near=_packed(near),
-        far=_packed(_pattern(rng, _FAR_PX, far_colour, 12.0, 24)),
+        far=_packed(_pattern(rng, 512, far_colour, 12.0, 24)),  # 0.9 m a px: the haze hides finer ones
         horizon=np.array(horizon, float),
         zenith=np.array(zenith, float),
         sun=sun,
@@ -328,7 +322,8 @@ def _paint_lines(rng: np.random.Generator, near: np.ndarray) -> None:
 
 def _places(rng: np.random.Generator, count: int) -> np.ndarray:
     """(count, 2) m around the origin."""
-    distance, bearing = rng.uniform(_LEAST_M, _MOST_M, count), rng.uniform(-np.pi, np.pi, count)
+    # Beyond the person's path, m; a judgement.
+    distance, bearing = rng.uniform(32.0, 95.0, count), rng.uniform(-np.pi, np.pi, count)
     return np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=1)
 
 

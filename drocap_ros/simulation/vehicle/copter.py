@@ -88,10 +88,10 @@ class SimulatedCopter(ReportingCopter):
 
     def move_stick(self) -> None:
         """The pilot moves a stick: in the control mode it counts only where a setting allows it."""
-        override = self.simulated.override
-        if override is None or self.mode != self.kind.control_mode:
+        if self.simulated.override is None or self.mode != self.kind.control_mode:
             return
-        if int(self.settings.get(override.setting, override.shipped)) & override.bit:
+        setting, bit, shipped = self.simulated.override
+        if int(self.settings.get(setting, shipped)) & bit:
             self.set_mode(self.simulated.stick_mode, "pilot")
 
     def _move(self, dt: float) -> None:

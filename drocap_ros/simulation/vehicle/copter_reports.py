@@ -77,11 +77,9 @@ class EstimateError:
         self._now, self._before = after + self._noise * noise, now
 
 
-_YAW_LAG_S = 0.1  # this and the next three: fitted to recorded orbits in 0 and 8 m/s of wind
-_MAX_YAW_RATE = 1.6  # rad/s
+_MAX_YAW_RATE = 1.6  # rad/s; this and the next fitted to the same orbits as the lag of yaw
 _GUST = 0.09  # share of the wind
 _GUST_AXES = np.array([1.0, 1.0, 0.2])  # it blows along the ground
-_GUST_TURN = 0.27  # rad/s of yaw per m/s of lateral gust
 
 
 class Body:
@@ -121,8 +119,9 @@ class Body:
         self.position = self.position + self.velocity * dt + 0.5 * self.acceleration * dt * dt
         self.velocity = self.velocity + self.acceleration * dt
         rate = min(max(yaw_rate, -_MAX_YAW_RATE), _MAX_YAW_RATE)
-        rate += _GUST_TURN * (self._gust[1] * math.cos(self.yaw) - self._gust[0] * math.sin(self.yaw))
-        self.yaw_rate += (rate - self.yaw_rate) * (1 - math.exp(-dt / _YAW_LAG_S))
+        # Lag of yaw, and rad/s of yaw per m/s of lateral gust, fitted to recorded orbits in 0 and 8 m/s of wind.
+        rate += 0.27 * (self._gust[1] * math.cos(self.yaw) - self._gust[0] * math.sin(self.yaw))
+        self.yaw_rate += (rate - self.yaw_rate) * (1 - math.exp(-dt / 0.1))
         self.yaw = math.remainder(self.yaw + self.yaw_rate * dt, 2 * math.pi)
 
     def drag(self) -> np.ndarray:
@@ -150,7 +149,6 @@ class Body:
         ])  # fmt: skip
 
 
-_GPS_NOTICED_S = 0.4  # from the loss of satellites to its report: measured
 EKF_NOTICED_S = 7.4  # from the loss of satellites to the estimator's report: measured
 _CONSTANT_POSITION = ESTIMATOR_HEALTHY & ~(8 | 16) | 128
 _NO_POSITION = 1 | 2 | 4  # POSITION_TARGET_TYPEMASK
@@ -271,7 +269,8 @@ class ReportingCopter(SimulatedVehicle):
         return _CONSTANT_POSITION if blind else super()._estimator_flags()
 
     def _satellites(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message:
-        there = self._fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
+        # From the loss of satellites to its report: measured.
+        there = self._fix_s <= self._t <= self.gps_lost_s + 0.4
         fix, place = 3 if there else 1, (473977420, 85455940, 488000)
         return self._mav.gps_raw_int_encode(self._boot_ms(t_s) * 1000, fix, *place, 60, 90, 0, 0, 17)
 

@@ -13,8 +13,6 @@ from drocap_ros.flight.autopilot.autopilot import Simulated
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
 
 MAX_LEAN_M_S2 = 5.66  # 30 degrees
-_CLIMB_GAIN = 1.0  # 1/s of the height; this and the next two as ArduPilot ships
-_CLIMB_RATE_GAIN = 4.0  # 1/s of the climb
 _MAX_CLIMB_M_S = 2.5  # as ArduPilot ships
 _MAX_CLIMB_M_S2 = 3.0  # assumed
 
@@ -134,12 +132,12 @@ class FlightControl:
     def _climb(self, height: float, climb: float, dt: float) -> float:
         wanted = float(self.target.velocity[2])
         if self.target.position is not None:
-            wanted += _CLIMB_GAIN * (float(self.target.position[2]) - height)
+            wanted += float(self.target.position[2]) - height  # a gain of 1/s as ArduPilot ships
         wanted = min(max(wanted, -_MAX_CLIMB_M_S), _MAX_CLIMB_M_S)
         self.commanded_velocity[2] = wanted
         error = wanted - climb
         self._integral[2] += 0.5 * error * dt
-        command = _CLIMB_RATE_GAIN * error
+        command = 4.0 * error  # as ArduPilot ships
         return min(max(command, -_MAX_CLIMB_M_S2), _MAX_CLIMB_M_S2) + self._integral[2]
 
     def _without_setpoints(self, dt: float) -> None:

@@ -5,7 +5,7 @@ import math
 import random
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from orbit_observations import GOOD, LIMITS, LOITER, changed, orbiting
 
@@ -90,6 +90,7 @@ def test_a_stream_that_was_interrupted_does_not_resume_by_itself(seen, timeout_s
 MODES = ("OFFBOARD", "LOITER", "RTL", "POSCTL", "")
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_after_a_foreign_mode_nothing_is_sent_until_the_operator_commands(seed):
     chance = random.Random(seed)
