@@ -333,7 +333,7 @@ class PoseEstimatorNode(ManagedComponent):
             self._follower.correct(seen)
         observation = self._follower.follow(frame)
         if observation is not None:
-            self._publish(observation, header, propagated=True)
+            self._publish(observation, header, propagated=bool(np.isfinite(observation.keypoints).any()))
         if self._beside.offer(frame, header, published=observation is not None):
             self.missed(_TOPIC, 1)
 

@@ -117,10 +117,14 @@ class Follower:
         self._flow = flow
         #: From the one on that the networks look at; so many may pass meanwhile.
         self._images: deque[Frame] = deque(maxlen=_MOST_IMAGES)
+        #: The networks' last word where that had no keypoints: it holds until the next one.
+        self._nothing: PoseObservation | None = None
 
     def follow(self, frame: Frame) -> PoseObservation | None:
         """The subject in the next image; None where too little of it is known or found."""
         self._images.append(frame)
+        if self._nothing is not None:
+            return dataclasses.replace(self._nothing, stamp_ns=frame.stamp_ns, background=None)
         return self._flow.propagate(frame.image, frame.stamp_ns)
 
     def correct(self, seen: PoseObservation) -> None:
@@ -129,6 +133,7 @@ class Follower:
             self._images.popleft()
         if not self._images or self._images[0].stamp_ns != seen.stamp_ns:
             return
+        self._nothing = None if np.isfinite(seen.keypoints).any() else seen
         first, *later = self._images
         self._flow.start(first.image, seen)
         for frame in later:
