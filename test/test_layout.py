@@ -29,7 +29,7 @@ BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
      "stamps", "background", "tracks", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "live_replay"): 4.20,  # points of the scene, everybody in pictures; lenses
-    ("perception",): 6.52,  # points of the scene; one who is followed live, and everybody in a recording
+    ("perception",): 6.53,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 12.84,  # one engine, one camera; paths by points, live windows; lenses of joined views (0.09)
     ("flight",): 9.29,  # a process that holds after the bridge's death; preflight, of the machine too; heights
     ("recording",): 6.55,  # keypoints of any order (0.45), tables, GPX, GPMF, several in a log; damaged recordings
