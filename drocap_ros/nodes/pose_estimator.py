@@ -263,6 +263,7 @@ class PoseEstimatorNode(ManagedComponent):
         self._end_ahead()
         with self._beside.looking:
             self._estimator, self._roi = None, None
+        self._shared.close()
 
     def expect(self, stamp_ns: int, jpeg: Future[bytes]) -> None:
         """Look at a picture that will be published."""

@@ -39,8 +39,11 @@ def test_the_newest_images_are_found_by_their_stamps(ring):
     # Another size, and another writer after the death of the first one.
     writer.put(30, image_of(30, (20, 10)))
     assert np.array_equal(reader.get(30), image_of(30, (20, 10)))
+    reader.close()  # as one that starts anew: its writer goes on in a new file
+    writer.put(31, image_of(31, (20, 10)))
+    assert np.array_equal(reader.get(31), image_of(31, (20, 10)))
     writer.close()
-    assert reader.get(30) is None
+    assert reader.get(31) is None
 
 
 def test_no_image_is_a_mixture_of_two(ring):
