@@ -37,7 +37,7 @@ from drocap_ros.ros.topics import TOPIC_SOURCE
 
 #: An image of a file that is this late when it has been read is dropped: three images at 30 Hz.
 _LATE_S = 0.1
-#: Images of a topic that may wait, while the one before is encoded.
+#: Images of a topic that may arrive together, while the one before is encoded.
 _DEPTH = 5
 #: Messages of images by the names of their types.
 _KINDS = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
@@ -180,7 +180,7 @@ class ImageIngestNode(ThreadedSource):
             return
         self._unsubscribe()
         qos = QoSProfile(depth=_DEPTH, reliability=wanted)
-        take = self.guarded(self._topic, self._take, stamps=True)
+        take = self.newest(self._topic, self._take, stamps=True)
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = self.create_subscription(kind, self._topic, take, qos, event_callbacks=events)
 

@@ -263,6 +263,7 @@ class PoseEstimatorNode(ManagedComponent):
         self._end_ahead()
         with self._beside.looking:
             self._estimator, self._roi = None, None
+        self._shared.close()
 
     def expect(self, stamp_ns: int, jpeg: Future[bytes]) -> None:
         """Look at a picture that will be published."""
@@ -333,7 +334,7 @@ class PoseEstimatorNode(ManagedComponent):
             self._follower.correct(seen)
         observation = self._follower.follow(frame)
         if observation is not None:
-            self._publish(observation, header, propagated=True)
+            self._publish(observation, header, propagated=bool(np.isfinite(observation.keypoints).any()))
         if self._beside.offer(frame, header, published=observation is not None):
             self.missed(_TOPIC, 1)
 

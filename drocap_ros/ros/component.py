@@ -215,11 +215,11 @@ class ComponentNode(Node):
         newest : messages that have waited in line are passed over and counted; in simulated time none waits
         """
         entry = TOPICS[topic]
-        if newest and not self.simulated:
-            callback, with_info = self._newest(topic, callback), True
-        take = self.guarded(topic, callback, stamps=entry.one_clock)
-        if with_info:
-            take = taking_info(take)
+        if newest:
+            take = self.newest(topic, callback, stamps=entry.one_clock)
+        else:
+            take = self.guarded(topic, callback, stamps=entry.one_clock)
+            take = taking_info(take) if with_info else take
         if qos is None:  # in simulated time no driver publishes, and every message counts
             qos = RESULT_QOS if topic == "camera_info" and self.simulated else entry.qos
         subscribe = partial(self.create_subscription, entry.message, topic, take, raw=raw)
@@ -230,7 +230,10 @@ class ComponentNode(Node):
             self.create_timer(_KEPT_PERIOD_S, partial(self._hear_kept, topic, subscribe))
         return subscription
 
-    def _newest(self, topic: str, callback: Callable[..., None]) -> Callable[..., None]:
+    def newest(self, topic: str, callback: Callable[..., None], *, stamps: bool) -> Callable[..., None]:
+        """Wrap a callback as :meth:`guarded`; messages that have waited in line are passed over and counted."""
+        if self.simulated:
+            return self.guarded(topic, callback, stamps=stamps)
         line = Line()
 
         def take(message: Message, info: MessageInfo) -> None:
@@ -241,7 +244,7 @@ class ComponentNode(Node):
             callback(message)
             line.took((time.time_ns() - begin_ns) * 1e-9)
 
-        return take
+        return taking_info(self.guarded(topic, take, stamps=stamps))
 
     def _hear_kept(self, topic: str, subscribe: Callable[..., Subscription]) -> None:
         """Subscribe a second time, until a message comes, where a publisher keeps its last one for late subscribers."""

@@ -28,11 +28,11 @@ class SharedImages:
         self._path = _FOLDER / f"drocap_{os.getuid()}_{name}"
         self._memory: mmap.mmap | None = None
         self._inode = self._refused = 0
-        self._wrote = False
 
     def put(self, stamp_ns: int, image: np.ndarray) -> None:
         """Write an image (H, W, 3) uint8; where there is no room it is left out."""
-        if self._memory is None or tuple(self._head()[:2]) != image.shape[:2]:
+        there = self._path.exists()  # a reader that ends removes the file: its writer may have been killed
+        if self._memory is None or not there or tuple(self._head()[:2]) != image.shape[:2]:
             self._create(image)
         if self._memory is None:
             return
@@ -47,7 +47,7 @@ class SharedImages:
         with contextlib.suppress(OSError, ValueError):
             stat = self._path.stat()
             if stat.st_ino != self._inode:
-                self.close()
+                self._memory, self._inode = None, 0
                 if stat.st_uid == os.getuid():
                     with self._path.open("r+b") as file:
                         self._memory, self._inode = mmap.mmap(file.fileno(), 0), stat.st_ino
@@ -60,12 +60,11 @@ class SharedImages:
         return None
 
     def close(self) -> None:
-        """Release the memory; its writer removes it."""
-        self._memory, self._inode = None, 0
-        if self._wrote:
-            self._wrote = False
+        """Release the memory, and remove its file."""
+        if self._memory is not None:
             with contextlib.suppress(OSError):
                 self._path.unlink()
+        self._memory, self._inode = None, 0
 
     def _create(self, image: np.ndarray) -> None:
         """A new ring for images of this size."""
@@ -86,7 +85,6 @@ class SharedImages:
                 self._memory, self._inode = mmap.mmap(file.fileno(), size), os.fstat(file.fileno()).st_ino
             self._head()[:2] = image.shape[:2]
             new.rename(self._path)
-            self._wrote = True
 
     def _head(self) -> np.ndarray:
         assert self._memory is not None

@@ -243,6 +243,17 @@ def test_keypoints_of_another_stream_are_not_taken_for_those_of_an_image_that_wa
     assert follower.follow(Frame(2 * STEP_NS, images[2])) is None
 
 
+def test_where_the_networks_find_no_keypoints_that_holds_until_they_look_again(estimator, images):
+    follower = Follower(estimator.hand_over())
+    for i in range(6):
+        follower.follow(Frame(i * STEP_NS, images[i]))
+    follower.correct(PoseObservation(STEP_NS, 0, (1280, 720)))
+    nobody = follower.follow(Frame(6 * STEP_NS, images[6]))
+    assert (nobody.stamp_ns, nobody.track_id, len(nobody.keypoints)) == (6 * STEP_NS, 0, 0)
+    follower.correct(estimator.process(images[4], 4 * STEP_NS))
+    assert np.isfinite(follower.follow(Frame(7 * STEP_NS, images[7])).keypoints).any()
+
+
 def test_followed_keypoints_of_a_picture_that_stands_still_repeat_bit_for_bit(estimator, images):
     follower, first = Follower(estimator.hand_over()), estimator.process(images[0], 0)
     follower.follow(Frame(0, images[0]))

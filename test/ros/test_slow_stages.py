@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rclpy
 from live_stream import observed
+from rclpy.context import Context
 from sensor_msgs.msg import CompressedImage
 
-from drocap_ros.bringup import bringup
+from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
 from drocap_ros.nodes.bundle_adjuster import BundleAdjusterNode
+from drocap_ros.nodes.image_ingest import ImageIngestNode
 from drocap_ros.nodes.pose_estimator import ImageQueue
+from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.reconstruction.live.core import LiveCore
 from drocap_ros.reconstruction.live.initializer import LiveInitializer
+from drocap_ros.ros import component
 from drocap_ros.ros.component import Line
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
@@ -73,6 +79,38 @@ def test_no_result_is_older_than_two_periods_of_its_stage_and_its_work(stage, sl
     # As many results as there is time for, and all of them where there is enough.
     assert len(ages) >= 0.7 * 300 * PERIOD_S / period_s
     assert missed == 0 or work_s > PERIOD_S
+
+
+@pytest.mark.parametrize("slower", [1, 2, 4, 8])
+def test_an_image_topic_that_is_too_fast_is_passed_over_up_to_its_newest_images(slower, monkeypatch):
+    """Of the middleware's queue, which keeps the newest; the clock is that of the test."""
+    now_s, ages, work_s = [1.0], [], slower * WORK_S
+
+    def take(self, message):
+        now_s[0] += work_s
+        ages.append(now_s[0] - message.arrived_s)
+
+    monkeypatch.setattr(ImageIngestNode, "_take", take)
+    monkeypatch.setattr(component.time, "time_ns", lambda: round(now_s[0] * 1e9))
+    with free_domain() as domain_id:
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=domain_id)
+        node = ImageIngestNode(ImageIngestConfig(source="topic:/camera"), context=context, use_global_arguments=False)
+        try:
+            node.active, heard = True, node.newest("/camera", node._take, stamps=False)
+            waiting, due = deque(maxlen=5), deque(1.0 + PERIOD_S * i for i in range(300))
+            while due or waiting:
+                now_s[0] = now_s[0] if waiting else max(now_s[0], due[0])
+                while due and due[0] <= now_s[0]:
+                    waiting.append(due.popleft())
+                arrived_s = waiting.popleft()
+                heard(SimpleNamespace(arrived_s=arrived_s), {"received_timestamp": round(arrived_s * 1e9)})
+        finally:
+            node.close()
+            node.destroy_node()
+            context.try_shutdown()
+    assert max(ages) <= 2 * max(work_s, PERIOD_S) + work_s + 1e-6
+    assert len(ages) >= 0.7 * 300 * PERIOD_S / max(work_s, PERIOD_S)
 
 
 def test_images_that_wait_behind_a_seldom_long_one_all_count():

@@ -83,6 +83,8 @@ class Decoder:
         self._scaler = self._av.video.reformatter.VideoReformatter()
         self._size: tuple[int, int] | None = None
         self._progressive: Graph | None = None
+        self._turn: int | None = None  # degrees, of the matrix by which images are shown
+        self._matrix: Any = None
         #: Times of packets that did not decode, None where a packet has none, s.
         self.damaged: list[float | None] = []
 
@@ -129,7 +131,11 @@ class Decoder:
         bgr = self._scaler.reformat(frame, *self._size, "bgr24", interpolation="BICUBIC").to_ndarray()
         pts = frame.dts if frame.pts is None else frame.pts
         time_ns = None if pts is None else round(pts * (frame.time_base or self._time_base) * _NS)
-        return time_ns, _upright(bgr, frame.side_data.get(self._av.sidedata.sidedata.Type.DISPLAYMATRIX))
+        if frame.rotation != self._turn:
+            # Seldom: a frame and its side data refer to each other, megabytes that wait for the garbage collector.
+            self._turn = frame.rotation
+            self._matrix = frame.side_data.get(self._av.sidedata.sidedata.Type.DISPLAYMATRIX)
+        return time_ns, _upright(bgr, self._matrix)
 
 
 def _upright(image: np.ndarray, matrix: Any) -> np.ndarray:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import struct
 from pathlib import Path
 
@@ -58,6 +59,22 @@ def test_nominal_rate_does_not_replace_the_times(tmp_path):
     with open_source(path) as source:
         stamps = [f.stamp_ns for f in source]
     np.testing.assert_allclose(np.diff(stamps), 2e8, atol=1e4)
+
+
+def test_frames_do_not_wait_for_the_garbage_collector(tmp_path):
+    """Megabytes each, and too few objects for it to begin."""
+    av = pytest.importorskip("av")
+    video = tmp_path / "long.mp4"
+    write_video(video, 60)
+    gc.collect()
+    gc.disable()
+    try:
+        with open_source(video) as source:
+            assert sum(1 for _ in source) == 60
+            left = sum(isinstance(thing, av.VideoFrame) for thing in gc.get_objects())
+    finally:
+        gc.enable()
+    assert left < 10
 
 
 def test_rotation_metadata_is_applied(tmp_path):
