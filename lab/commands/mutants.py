@@ -103,16 +103,23 @@ def draw(rooms: list[str], number: int, seed: int) -> list[Mutant]:
 
 
 def judges_of(path: str) -> list[list[str]]:
-    """Test files of a module in groups, one after the other: those that import it, then those of its room."""
+    """Test files of a module in groups, one after the other: those that import it, then those of its room.
+
+    In a group those of its own folder begin: they are the ones that fail, and soon.
+    """
     name = ".".join(Path(path).with_suffix("").parts).removesuffix(".__init__")
     room = Path(path).parts[1]
     files = {
         str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in (ROOT / "test").rglob("test_*.py")
     }
-    near = sorted(file for file, text in files.items() if name in text or Path(path).stem in Path(file).stem)
+    near = [file for file, text in files.items() if name in text or Path(path).stem in Path(file).stem]
     folders = [f"test/{room}/", *{"flight": ["test/lab/flights/"], "ros": ["test/nodes/"]}.get(room, [])]
-    others = [sorted(file for file in files if file.startswith(top) and file not in near) for top in folders]
-    return [near, *others]
+    groups = [near, *([file for file in files if file.startswith(top) and file not in near] for top in folders)]
+    own = Path("test", *Path(path).parts[1:-1])
+    return [
+        sorted(group, key=lambda file: (own not in Path(file).parents, not file.startswith(folders[0]), file))
+        for group in groups
+    ]
 
 
 def survives(mutant: Mutant, seconds: float) -> str:

@@ -6,7 +6,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import AUTOPILOTS, UNKNOWN, autopilot_by_heartbeat, autopilot_of, supported_titles
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.reports import ModeReports
+from drocap_ros.flight.orbit.motion_checks import loss_condition
 
 EVERY = pytest.mark.parametrize("autopilot", AUTOPILOTS.values(), ids=AUTOPILOTS)
 
@@ -33,6 +35,13 @@ def test_settings_that_decide_without_setpoints_are_read_before_a_flight(autopil
     if (action := autopilot.loss_action) is not None:
         assert action.hold not in action.fatal | action.leaves
         assert set(action.words) >= set(action.fatal) | set(action.leaves) | set(action.modes)
+
+
+@EVERY
+def test_a_simulated_one_reports_settings_with_which_motion_is_allowed(autopilot):
+    settings = autopilot.loss_settings(autopilot.simulated.settings)
+    longest_s = MavlinkBridgeConfig().max_control_timeout_s
+    assert loss_condition(settings, autopilot.loss_action, longest_s) is None
 
 
 @EVERY
