@@ -103,23 +103,27 @@ def draw(rooms: list[str], number: int, seed: int) -> list[Mutant]:
 
 
 def judges_of(path: str) -> list[list[str]]:
-    """Test files of a module in groups, one after the other: those that import it, then those of its room.
+    """Test files of a module in groups, one after the other, those that fail soonest first.
 
-    In a group those of its own folder begin: they are the ones that fail, and soon.
+    Of its room those that import it, of others those that import it, its folder, its room, flights or nodes.
     """
     name = ".".join(Path(path).with_suffix("").parts).removesuffix(".__init__")
-    room = Path(path).parts[1]
+    room, own = Path(path).parts[1], str(Path("test", *Path(path).parts[1:-1]))
     files = {
         str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in (ROOT / "test").rglob("test_*.py")
     }
-    near = [file for file, text in files.items() if name in text or Path(path).stem in Path(file).stem]
-    folders = [f"test/{room}/", *{"flight": ["test/lab/flights/"], "ros": ["test/nodes/"]}.get(room, [])]
-    groups = [near, *([file for file in files if file.startswith(top) and file not in near] for top in folders)]
-    own = Path("test", *Path(path).parts[1:-1])
-    return [
-        sorted(group, key=lambda file: (own not in Path(file).parents, not file.startswith(folders[0]), file))
-        for group in groups
-    ]
+    near = {file for file, text in files.items() if name in text or Path(path).stem in Path(file).stem}
+    more = {"flight": "test/lab/flights/", "ros": "test/nodes/"}.get(room, f"{own}/")
+    groups: list[list[str]] = []
+    for judges, top in (
+        (near, f"test/{room}/"),
+        (near, ""),
+        (files, f"{own}/"),
+        (files, f"test/{room}/"),
+        (files, more),
+    ):
+        groups.append(sorted(file for file in judges if file.startswith(top) and not any(file in g for g in groups)))
+    return groups
 
 
 def survives(mutant: Mutant, seconds: float) -> str:
