@@ -22,8 +22,8 @@ pytest_plugins = ["fixtures_export", "fixtures_recording", "fixtures_reconstruct
 CLOCKED = (
     "nodes", "ros", "station", "system", "view", "cli/test_live_cli.py", "cli/test_preflight_command.py",
     "app/test_app_in_browser.py",
-    "lab/commands/test_train_lifter.py", "flight/mavlink/test_link.py", "flight/mavlink/test_signing.py",
-    "perception/sources/test_live_sources.py", "perception/models/test_fetch.py",
+    "lab/commands/test_train_lifter.py", "flight/mavlink/test_guardian.py", "flight/mavlink/test_link.py",
+    "flight/mavlink/test_signing.py", "perception/sources/test_live_sources.py", "perception/models/test_fetch.py",
     "recording/mcap/test_bounded_queue.py", "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
     "recording/telemetry/test_flight_to_tracks.py",
 )  # fmt: skip
