@@ -24,8 +24,8 @@ CLOCKED = (
     "app/test_app_in_browser.py",
     "lab/commands/test_train_lifter.py", "flight/mavlink/test_guardian.py", "flight/mavlink/test_link.py",
     "flight/mavlink/test_signing.py", "perception/sources/test_live_sources.py", "perception/models/test_fetch.py",
-    "recording/mcap/test_bounded_queue.py", "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
-    "recording/telemetry/test_flight_to_tracks.py",
+    "recording/mcap/test_bounded_queue.py", "recording/mcap/test_killed_recorder.py",
+    "recording/mcap/test_session_writer.py", "recording/telemetry/test_flight_to_tracks.py",
 )  # fmt: skip
 COMPUTING = (
     "system/test_packaging.py", "system/test_simulated_demo.py", "ros/test_conversions.py", "ros/test_diagnostics.py",
