@@ -22,13 +22,15 @@ pytest_plugins = ["fixtures_export", "fixtures_recording", "fixtures_reconstruct
 CLOCKED = (
     "nodes", "ros", "station", "system", "view", "cli/test_live_cli.py", "cli/test_preflight_command.py",
     "app/test_app_in_browser.py",
-    "lab/commands/test_train_lifter.py", "flight/mavlink/test_link.py", "flight/mavlink/test_signing.py",
-    "flight/mavlink/test_gimbal.py", "perception/sources/test_live_sources.py",
-    "perception/models/test_fetch.py", "recording/mcap/test_bounded_queue.py",
-    "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
-    "recording/telemetry/test_flight_to_tracks.py",
+    "lab/commands/test_train_lifter.py", "flight/mavlink/test_guardian.py", "flight/mavlink/test_link.py",
+    "flight/mavlink/test_signing.py", "perception/sources/test_live_sources.py", "perception/models/test_fetch.py",
+    "recording/mcap/test_bounded_queue.py", "recording/mcap/test_killed_recorder.py",
+    "recording/mcap/test_session_writer.py", "recording/telemetry/test_flight_to_tracks.py",
 )  # fmt: skip
-COMPUTING = ("system/test_packaging.py", "system/test_simulated_demo.py")
+COMPUTING = (
+    "system/test_packaging.py", "system/test_simulated_demo.py", "ros/test_conversions.py", "ros/test_diagnostics.py",
+    "ros/test_markers.py",
+)  # fmt: skip
 #: Those of them that count messages or frames while the graph is busy: many tests beside them disturb them.
 COUNTING = (
     "nodes/test_bundle_adjuster.py", "nodes/test_live_replay.py", "ros/test_slow_stages.py", "system/test_bringup.py",

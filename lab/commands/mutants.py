@@ -103,16 +103,17 @@ def draw(rooms: list[str], number: int, seed: int) -> list[Mutant]:
 
 
 def judges_of(path: str) -> list[list[str]]:
-    """Test files of a module in groups, one after the other: those that import it, then those of its room."""
+    """Test files of a module, those that fail soonest first: what imports it, its folder, its room, flights, nodes."""
     name = ".".join(Path(path).with_suffix("").parts).removesuffix(".__init__")
-    room = Path(path).parts[1]
-    files = {
-        str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in (ROOT / "test").rglob("test_*.py")
-    }
-    near = sorted(file for file, text in files.items() if name in text or Path(path).stem in Path(file).stem)
-    folders = [f"test/{room}/", *{"flight": ["test/lab/flights/"], "ros": ["test/nodes/"]}.get(room, [])]
-    others = [sorted(file for file in files if file.startswith(top) and file not in near) for top in folders]
-    return [near, *others]
+    room, own = Path(path).parts[1], str(Path("test", *Path(path).parts[1:-1]))
+    files = {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in ROOT.glob("test/**/test_*.py")}
+    near = {file for file, text in files.items() if name in text or Path(path).stem in Path(file).stem}
+    more = {"flight": "test/lab/flights/", "ros": "test/nodes/"}.get(room, f"{own}/")
+    groups: list[list[str]] = []
+    tops = (near, f"test/{room}/"), (near, ""), (files, f"{own}/"), (files, f"test/{room}/"), (files, more)
+    for judges, top in tops:
+        groups.append(sorted(file for file in judges if file.startswith(top) and not any(file in g for g in groups)))
+    return groups
 
 
 def survives(mutant: Mutant, seconds: float) -> str:

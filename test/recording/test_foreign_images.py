@@ -17,7 +17,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.motion import load_motion
 from drocap_ros.perception.sources.video import decoded_packets
 from drocap_ros.recording.image_messages import image_from_message, read_images
-from drocap_ros.recording.open_session import open_session
+from drocap_ros.recording.open_session import foxglove_message, open_session
 from drocap_ros.tracks import load_tracks
 
 cv2 = pytest.importorskip("cv2")
@@ -178,6 +178,12 @@ def test_foxglove_images_and_videos_are_read(tmp_path, encoding, kind):
     assert [f.stamp_ns for f in frames] == [START_NS + i * STEP_NS for i in range(8)]
     for frame, image in zip(frames, images, strict=True):
         assert np.abs(frame.image.astype(int) - image).mean() < 6
+
+
+@pytest.mark.parametrize(("encoding", "nothing"), [("json", b'{"timestamp": {}}'), ("protobuf", b"")])
+def test_what_a_message_leaves_out_is_zero(encoding, nothing):
+    found = foxglove_message(nothing, encoding, "foxglove.RawImage")
+    assert (found.timestamp.sec, found.timestamp.nanosec, found.width, found.encoding) == (0, 0, 0, "")
 
 
 @pytest.mark.parametrize(

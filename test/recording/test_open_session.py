@@ -87,6 +87,16 @@ def test_sqlite3_without_embedded_definitions_is_read(tmp_path, messages, captur
         assert len(read_pose2d(session)) == 10
 
 
+def test_an_mcap_is_known_by_its_first_bytes_or_its_name(pose_session, tmp_path):
+    data = (pose_session / "session_0.mcap").read_bytes()
+    (tmp_path / "walk.bag").write_bytes(data)
+    with open_session(pose_session) as a, open_session(tmp_path / "walk.bag") as b:
+        assert np.array_equal(read_pose2d(a).keypoints, read_pose2d(b).keypoints, equal_nan=True)
+    (tmp_path / "walk.mcap").write_bytes(bytes(3) + data[3:])
+    with pytest.raises(InputError, match="expected an MCAP file, found other content at its start"):
+        open_session(tmp_path / "walk.mcap")
+
+
 def test_session_without_its_metadata_file_is_read(pose_session, capture):
     (pose_session / "metadata.yaml").unlink()
     with open_session(pose_session) as session:

@@ -176,6 +176,8 @@ def test_odometry_and_fix_say_what_the_vehicle_state_says():
     fix = c.fix_to_ros(state)
     assert (fix.latitude, fix.longitude, fix.status.status) == (47.5, 8.5, 0)
     assert np.isnan(fix.altitude)
+    kinds = [c.fix_to_ros(replace(state, gps_fix_type=kind)).status.status for kind in range(9)]
+    assert kinds == [-1, -1, -1, 0, 1, 2, 2, 2, 2]  # from the fifth on, corrected by a ground station
 
 
 def test_what_is_not_known_is_nan_and_no_fix():

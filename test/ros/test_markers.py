@@ -45,6 +45,7 @@ def test_ellipsoids_have_the_covariance_of_the_pose():
     balls = by_namespace(pose_markers(message, 0.5), "uncertainty")
     assert [ball.id for ball in balls] == list(range(15))
     for ball, wanted in zip(balls, full, strict=True):
+        assert 0 < ball.color.a < 1  # the joint inside is seen
         o = ball.pose.orientation
         axes = matrix_from_quaternion(np.array([o.x, o.y, o.z, o.w]))
         sigma = np.array([ball.scale.x, ball.scale.y, ball.scale.z]) / 4.0

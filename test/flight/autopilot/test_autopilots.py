@@ -3,11 +3,19 @@
 import math
 
 import pytest
+from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import AUTOPILOTS, UNKNOWN, autopilot_by_heartbeat, autopilot_of, supported_titles
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.reports import ModeReports
+from drocap_ros.flight.orbit.motion_checks import loss_condition
 
+#: Numbers of the modes by their names.
+PYMAVLINK = {
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: {name: number for number, name in mavutil.mode_mapping_acm.items()},
+    mavlink.MAV_AUTOPILOT_PX4: {name: main << 16 | sub << 24 for name, (_, main, sub) in mavutil.px4_map.items()},
+}
 EVERY = pytest.mark.parametrize("autopilot", AUTOPILOTS.values(), ids=AUTOPILOTS)
 
 
@@ -16,6 +24,7 @@ def test_modes_for_flight_are_in_its_table_by_the_names_of_pymavlink(autopilot):
     assert {autopilot.control_mode, autopilot.hold_mode, autopilot.handed_over_mode} <= set(autopilot.modes)
     for mode, number in autopilot.modes.items():
         assert autopilot.mode_name(number) == mode
+        assert number == PYMAVLINK[autopilot.mav_autopilot][mode]
         main, sub = autopilot.mode_numbers(mode)
         assert number == (main << 16 | sub << 24 if autopilot.submodes else main)
         reports = ModeReports()
@@ -33,6 +42,13 @@ def test_settings_that_decide_without_setpoints_are_read_before_a_flight(autopil
     if (action := autopilot.loss_action) is not None:
         assert action.hold not in action.fatal | action.leaves
         assert set(action.words) >= set(action.fatal) | set(action.leaves) | set(action.modes)
+
+
+@EVERY
+def test_a_simulated_one_reports_settings_with_which_motion_is_allowed(autopilot):
+    settings = autopilot.loss_settings(autopilot.simulated.settings)
+    longest_s = MavlinkBridgeConfig().max_control_timeout_s
+    assert loss_condition(settings, autopilot.loss_action, longest_s) is None
 
 
 @EVERY

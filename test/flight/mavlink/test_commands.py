@@ -150,6 +150,7 @@ def test_contradicting_parameters_of_the_bridge_are_refused(values, word):
 def test_watchdog_sends_the_fallback_commands_only_when_the_loop_hangs():
     sent, visible = [], False
     dog = Watchdog(sent.append, 0.2)
+    assert dog.take_fired() == (False, False)
     commands = FallbackCommands("hold", "mode", lambda: visible, lambda: False)
     for i in range(20):
         dog.kick(0.05 * i, commands)

@@ -102,6 +102,24 @@ def test_only_a_fresh_range_finder_that_looks_down_and_is_in_range_tells_the_cle
     assert math.isnan(clearance(10, down))
 
 
+def test_nothing_but_an_attitude_gives_a_state(ready):
+    """A clock that has jumped gives the attitude before another stamp: it is the same state nevertheless."""
+    estimator, sender = ready
+    others = [
+        sender("local_position_ned", 2000, 1, 2, -3, 1, 0, 0),
+        sender("global_position_int", 2000, 10, 20, 30, 0, 0, 0, 0, 0),
+        sender("gps_raw_int", 2_000_000, 3, 10, 20, 30, 0, 0, 0, 0, 9),
+        sender("sys_status", 0, 0, 0, 0, 12_000, 0, 90, 0, 0, 0, 0, 0, 0),
+        sender("extended_sys_state", 0, 1),
+        sender("distance_sensor", 2000, 20, 4000, 300, 0, 1, mavlink.MAV_SENSOR_ROTATION_PITCH_270, 255),
+        Sender(component=154)("gimbal_device_attitude_status", 0, 0, 2000, 32, (1, 0, 0, 0), 0, 0, 0, 0),
+    ]
+    for i, message in enumerate(others):
+        assert estimator.update(attitude(sender, 1000 + i), (20 + 20 * i) * S) is not None
+        estimator.update(sender("system_time", 0, 1000 + i), (30 + 20 * i) * S)
+        assert estimator.update(message, (30 + 20 * i) * S) is None
+
+
 def test_old_position_is_unknown(ready):
     estimator, sender = ready
     estimator.update(sender("local_position_ned", 1000, 1, 2, -3, 1, 0, 0), 10 * S)

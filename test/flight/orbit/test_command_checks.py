@@ -59,6 +59,11 @@ def test_values_outside_the_limits_are_refused(values, code):
     assert isinstance(found, Condition)
     assert found.code == code
     assert next(iter(values)) in str(found)
+    # The limit that the refusal names is no value of the same refusal.
+    if "limit" in found.values:
+        sense = math.copysign(1.0, values.get("angular_speed_deg_s", 1.0))
+        named = dict.fromkeys(values, sense * found.values["limit"])
+        assert getattr(commanded_goal(CONFIG, OperatorCommand(START, **named), None), "code", None) != code
 
 
 def test_radius_beyond_the_fence_is_refused():

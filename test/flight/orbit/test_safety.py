@@ -205,6 +205,8 @@ def test_start_never_changes_the_mode_and_engage_only_when_allowed():
     assert refusal(decision) == ConditionCode.PACKETS_LOST
     assert "40 % of the autopilot's packets" in str(decision.answer.condition)
     assert decision.mode_request == ModeRequest.NONE
+    named = changed(LOITER, packet_loss=decision.answer.condition.values["most_percent"] / 100)
+    assert reduce(Idle(), named, 0.0, Command.ENGAGE, LIMITS)[1].answer.accepted
     state, decision = reduce(Idle(), LOITER, 0.0, Command.ENGAGE, LIMITS)
     assert decision.mode_request == ModeRequest.CONTROL
     state, decision = reduce(permit_mode(state, "GUIDED"), GOOD, 0.3, None, LIMITS)

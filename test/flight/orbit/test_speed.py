@@ -9,7 +9,7 @@ from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, changed, orbiting
 from drocap_ros.flight.autopilot.coasting import Setpoint
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
-from drocap_ros.flight.orbit.speed import allowed_pace, next_pace, slowed
+from drocap_ros.flight.orbit.speed import allowed_pace, next_pace, slowed, waiting
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, Pace, State
 
 OLD = {
@@ -214,3 +214,12 @@ def test_slowed_setpoint_scales_velocity_and_stands_without_acceleration():
     assert not still.acceleration.any()
     assert np.array_equal(still.position, full.position)
     assert np.linalg.norm(slowed(full, Pace(0.9, -0.6, 0.9, 0.0), 0.5).acceleration) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("most_m", [0.2, 1.5, 10.0])
+def test_the_reference_waits_the_longer_the_further_the_vehicle_lags_behind(most_m):
+    shares = np.array([waiting(lead * most_m, most_m) for lead in np.linspace(0.0, 3.0, 61)])
+    assert (shares[:11] == 1.0).all()  # behind by half of the greatest lead: as every vehicle flies
+    assert (np.diff(shares, axis=0) <= 0.0).all()
+    assert shares[20].tolist() == [0.0, 1.0]
+    assert shares[-1].tolist() == [0.0, 0.0]

@@ -253,6 +253,7 @@ def test_one_gap_in_the_telemetry_is_a_warning_and_lists_its_length():
     finding = Gap("ardupilot").findings["rate_attitude_quaternion"]
     assert finding.level == Level.WARNING
     assert 0.29 < finding.values["longest_gap_s"] < 0.35
+    assert f"longest gap {finding.values['longest_gap_s']:.2f} s" in finding.found
 
 
 def test_a_link_that_only_receives_has_no_round_trip():

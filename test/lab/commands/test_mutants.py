@@ -22,8 +22,10 @@ def test_each_mutant_changes_one_place_and_no_word():
 
 
 def test_a_module_is_judged_by_the_tests_that_import_it_first():
-    near, room, flights = judges_of("drocap_ros/flight/mavlink/guardian.py")
-    assert "test/flight/mavlink/test_guardian.py" in near
+    near, elsewhere, folder, room, flights = judges_of("drocap_ros/flight/mavlink/guardian.py")
+    assert near[0] == "test/flight/mavlink/test_guardian.py"
+    assert not any(file.startswith("test/flight/") for file in elsewhere)
+    assert "test/flight/mavlink/test_commands.py" in folder
     assert "test/flight/orbit/test_safety.py" in room
     assert "test/lab/flights/test_faults.py" in flights
 

@@ -257,6 +257,7 @@ def json_lines(folder, k, far):
 def test_a_file_that_is_cut_off_gives_what_is_whole(tmp_path, form, share, caplog):
     path = form(tmp_path, walk(30), walk(30) * 0.5)
     whole = read_keypoints(path)
+    assert "damaged" not in caplog.text
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     cut = read_keypoints(path)
