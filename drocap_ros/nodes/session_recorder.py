@@ -1,6 +1,6 @@
 """Node ``session_recorder``: every topic of the graph into a rosbag2 MCAP session.
 
-Subscribes to all topics of ``topics.TOPICS`` as serialized bytes and writes them unchanged.  The session's metadata
+Subscribes to the topics of the graph as serialized bytes and writes them unchanged.  The session's metadata
 hold the parameters of all nodes, the hashes of the models and the camera's calibration.
 """
 
@@ -69,7 +69,7 @@ class SessionRecorderNode(ManagedComponent):
             "camera_info": self._on_camera_info,
             "/diagnostics": self._on_diagnostics,
         }
-        for topic in TOPICS:
+        for topic in NODES[self.component].subscribes:
             name = self.resolve_topic_name(topic)
             take = special.get(topic, self._on_message)
             qos = IMAGE_RECORDING_QOS if topic == _IMAGES else None
@@ -83,8 +83,8 @@ class SessionRecorderNode(ManagedComponent):
         if self.config.if_taken == "next" or self._sessions:
             folder = _free_name(folder)
         writer = SessionWriter(folder, self.config, session_provenance(self.get_namespace()))
-        for topic, entry in TOPICS.items():
-            kind = _type_name(entry.message)
+        for topic in NODES[self.component].subscribes:
+            kind = _type_name(TOPICS[topic].message)
             writer.register(self.resolve_topic_name(topic), kind, schema_text(kind), image=topic == _IMAGES)
         self._writer, self._calibrated, self._received, self._recording = writer, False, False, False
         self._survey = ParameterSurvey(self, self.beside, self._on_parameters)
