@@ -240,7 +240,7 @@ def test_malformed_message_is_refused_counted_and_explained(bench, topic):
         bench.publishers[topic].publish(message)
         bench.graph.spin_for(0.15 if "compressed" in topic else 0.05)
     bench.graph.spin_for(1.5)
-    for _ in range(10):  # a busy node passes over messages, as it may
+    for _ in messages:  # a busy node passes over messages, as it may
         if min(refused()) >= len(messages):
             break
         bench.publishers[topic].publish(spoilt(bench, good, next(iter(wrong.values()))))
