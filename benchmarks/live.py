@@ -219,7 +219,8 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         for adjuster in (True, False):
             if args.no_adjuster and adjuster:
                 continue
-            for slow in args.slow:
+            # In one process the one that stops it would stop itself, too.
+            for slow in args.slow if processes else [1.0]:
                 name = ("processes" if processes else "one process") + ("" if adjuster else ", no adjuster")
                 name += f", {slow:g} times slower" if slow > 1.0 else ""
                 load = os.getloadavg()[0]
