@@ -108,7 +108,8 @@ def _shape(r: PathResiduals, found: Covariances, total: np.ndarray) -> np.ndarra
 def with_own_noise(r: PathResiduals) -> PathResiduals:
     """Residuals at the same point and robust weights, with the noise that they show: the priors keep their sizes."""
     # Half of the squared lengths of pairs with a standard deviation of 1 are below 1.39.
-    noise = max(float(np.median(r.square)) / 1.39, 1e-12)
+    # Simulated points may fit exactly: noise below a thousandth of the expected is that of single precision.
+    noise = max(float(np.median(r.square)) / 1.39, 1e-6)
     config = replace(r.data.config, noise_px=r.data.config.noise_px * float(np.sqrt(noise)))
     return PathResiduals(replace(r.data, config=config), r.weights, r.state, r.outlier / noise)
 

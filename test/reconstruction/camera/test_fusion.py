@@ -107,6 +107,22 @@ def test_exact_telemetry_stays_exact(true: Scene) -> None:
     assert moved < 0.02
 
 
+@pytest.mark.parametrize("noise_px", [0.0, 1e-4, 0.01])
+@pytest.mark.parametrize("way", [0.0, 1e-4, 0.01, 1.0])
+def test_points_without_noise_and_cameras_that_hardly_move_give_finite_errors(way: float, noise_px: float) -> None:
+    """As of simulators: a log of a camera that stands says so exactly, and its points stand."""
+    rotation, position = orbit(FRAMES, FPS)
+    turn = exp_so3(way * log_so3(rotation @ rotation[0].T)) @ rotation[0]
+    scene = seen(turn, position[0] + way * (position - position[0]), points_of(np.random.default_rng(2), 160), FPS)
+    found = fuse_telemetry(reported(scene), points_in(scene, noise_px))
+    if isinstance(found, Fusion):
+        pose, covariance = found.camera.pose, found.camera.covariance
+        assert all(np.isfinite(values).all() for values in pose)
+        assert covariance is not None
+        assert np.isfinite(covariance).all()
+        assert (np.linalg.eigvalsh(covariance) > -1e-12).all()
+
+
 def test_the_place_of_a_receiver_is_as_unknown_as_its_wander_whatever_the_noise_of_points(true: Scene) -> None:
     rotation = exp_so3(np.deg2rad(wave(FRAMES, 1.0))) @ true.rotation
     given = reported(true, rotation, true.position + wave(FRAMES, 0.5))
