@@ -27,6 +27,7 @@ _FEW_VALID = 0.25  # where the networks do not look at the image in any case: 2 
 _MANY_STEPS_SIGMA = 2 * _SIGMA  # and after four to seven steps joints err by 1.5 % in the median and 18 % at the 95th
 _LONGEST_S = 0.1  # between the two images: three of 30 Hz
 _MOST_IMAGES = 24  # that pass while the networks look at one: 0.8 s of 30 Hz
+_ALONE_NS = 800_000_000  # since the image that they looked at last: a network that hangs shows no subject
 
 
 class KeypointFlow:
@@ -124,13 +125,15 @@ class Follower:
         self._images: deque[Frame] = deque(maxlen=_MOST_IMAGES)
         #: The networks' last word where that had no keypoints: it holds until the next one.
         self._nothing: PoseObservation | None = None
+        self._looked_ns: int | None = None
 
     def follow(self, frame: Frame) -> PoseObservation | None:
         """The subject in the next image; None where too little of it is found, or no network looks any more."""
         self._images.append(frame)
         if self._nothing is not None:
             return dataclasses.replace(self._nothing, stamp_ns=frame.stamp_ns, background=None)
-        if self._flow.steps >= _MOST_IMAGES:
+        self._looked_ns = frame.stamp_ns if self._looked_ns is None else self._looked_ns
+        if frame.stamp_ns - self._looked_ns > _ALONE_NS:
             return None
         return self._flow.propagate(frame.image, frame.stamp_ns)
 
@@ -140,6 +143,7 @@ class Follower:
             self._images.popleft()
         if not self._images or self._images[0].stamp_ns != seen.stamp_ns:
             return
+        self._looked_ns = seen.stamp_ns
         self._nothing = None if np.isfinite(seen.keypoints).any() else seen
         first, *later = self._images
         self._flow.start(first.image, seen)
