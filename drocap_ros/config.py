@@ -19,7 +19,7 @@ from typing import get_type_hints
 from drocap_ros.errors import InputError, ParameterError
 from drocap_ros.export.stream_out_config import StreamOutConfig
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.parameters import Parameters, Values
+from drocap_ros.parameters import Parameters, Values, read_yaml
 from drocap_ros.perception.sources.base import ImageIngestConfig
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
@@ -68,20 +68,10 @@ def section_types() -> dict[str, type[Parameters]]:
 
 def load_config(path: str | Path | None) -> DrocapConfig:
     """Read a configuration file; missing sections and values, and all of them without a file, keep their defaults."""
-    import yaml
-
     if path is None:
         return DrocapConfig()
     path = Path(path)
-    try:
-        with path.open(encoding="utf-8") as stream:
-            data = yaml.safe_load(stream)
-    except OSError as error:
-        raise InputError(f"{path}: expected a configuration file; {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        place = getattr(error, "problem_mark", None)
-        where = f" at line {place.line + 1}" if place else ""
-        raise InputError(f"{path}: expected YAML, found something else{where}; correct the file") from None
+    data = read_yaml(path, "a configuration file")
     return parse_config(data or {}, str(path))
 
 

@@ -27,7 +27,8 @@ import numpy as np
 
 from drocap_ros.background import FARTHEST_PX
 from drocap_ros.errors import InputError, did_you_mean
-from drocap_ros.parameters import Values
+from drocap_ros.keypoints import difference_noise
+from drocap_ros.parameters import Values, read_yaml
 from drocap_ros.skeleton import other_side
 from drocap_ros.tracks import Tracks
 
@@ -76,15 +77,8 @@ class Corrections:
 
 def load_corrections(path: str | Path) -> Corrections:
     """Read a file of corrections; every entry is checked and the error names the file."""
-    import yaml
-
     path = Path(path)
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: expected a file of corrections; {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
-        raise InputError(f"{path}: expected YAML, found something else; correct the file") from None
+    data = read_yaml(path, "a file of corrections")
     try:
         return parse_corrections({} if data is None else data)
     except InputError as error:
@@ -272,8 +266,7 @@ def _with_places(tracks: Tracks, corrections: Corrections, seconds: np.ndarray) 
     high, low = (f(keypoints, axis=1) for f in (np.fmax.reduce, np.fmin.reduce))
     height = np.nan_to_num((high - low).max(axis=1), nan=0.1 * tracks.image_size[1])
     if tracks.covariance is None:  # that of the recording's own noise; errors last for some frames
-        third = np.abs(np.diff(keypoints, n=3, axis=0))
-        noise = 2.0 * 1.48 / np.sqrt(20.0) * float(np.nanmedian(third)) if np.isfinite(third).any() else 0.0
+        noise = 2.0 * difference_noise(keypoints) if len(keypoints) > 3 else 0.0
         variance = max(noise, _CLICKED_PX) ** 2 * np.array([1.0, 0.0, 1.0])
         covariance = np.broadcast_to(variance, (*keypoints.shape[:2], 3)).copy()
     else:

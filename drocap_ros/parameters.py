@@ -11,9 +11,10 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, get_type_hints
 
-from drocap_ros.errors import ParameterError, did_you_mean
+from drocap_ros.errors import InputError, ParameterError, did_you_mean
 
 P = TypeVar("P", bound="Parameters")
 T = TypeVar("T", bool, int, float, str)
@@ -99,3 +100,17 @@ def _range_text(low: float | None, high: float | None) -> str:
     if high is None:
         return f"at least {low:g}"
     return f"{low:g} to {high:g}"
+
+
+def read_yaml(path: Path, what: str) -> Any:
+    """Content of a YAML file; the error names the file, and where it is none."""
+    import yaml
+
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: expected {what}; {error.strerror or error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        place = getattr(error, "problem_mark", None)
+        where = f" at line {place.line + 1}" if place else ""
+        raise InputError(f"{path}: expected YAML, found something else{where}; correct the file") from None

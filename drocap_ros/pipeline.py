@@ -120,8 +120,7 @@ def reconstruct_input(
     tracks, origin = input_tracks(Path(path), config, models, progress, telemetry, selection)
     if selection.evidence is not None:
         tracks = with_evidence(tracks, selection.evidence)
-    images = selection.images or (Path(path) if needs_networks(Path(path), selection.redetect) else None)
-    meant = with_corrections(images, tracks, config, models, progress, selection)
+    meant = with_corrections(selection.images or Path(path), tracks, config, models, progress, selection)
     if selection.corrections:
         origin["corrections"] = selection.corrections.values
     if selection.rate_hz:
@@ -133,7 +132,20 @@ def reconstruct_input(
     motion = reconstruct(
         meant, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
+    for words in _said_in_vain(selection.corrections, motion):
+        logger.warning("%s: %s", path, words)
     return with_origin(motion, Path(path), origin, seconds), tracks
+
+
+def _said_in_vain(corrections: Corrections, motion: Motion) -> list[str]:
+    """Words about corrections that the motion could not follow."""
+    words = []
+    if corrections.feet and motion.frame == "camera":
+        words.append("feet: the motion has no world in which a foot rests; they change nothing")
+    if corrections.upright and (motion.frame == "camera" or "camera" not in motion.meta):
+        by = "the motion has no world" if motion.frame == "camera" else "telemetry tells up"
+        words.append(f"upright: {by}; it changes nothing")
+    return words
 
 
 def with_corrections(
@@ -152,7 +164,7 @@ def with_corrections(
             raise InputError(f"person: expected a time within the recording, found {span.from_s:g} s; correct it")
         other = None
         if box is not None:
-            if images is None:
+            if images is None or images.suffix == ".npz":
                 raise InputError("person: expected images for whoever is in a box, found none; name them: --video FILE")
             settings = config.pose_estimator
             settings = dataclasses.replace(settings, subject="box", subject_box=",".join(map(str, box)), on_loss="wait")

@@ -32,6 +32,7 @@ from lab.simulation.orbit import orbit_camera
 FPS, FRAMES, SIZE, FOCAL = 24.0, 150, (1280, 720), 1100.0
 BEGIN, END = 60, 84  # images in which the network errs
 KNEE, ANKLE = BODY_17.index("lknee"), BODY_17.index("lankle")
+EDGE = {"time": 0.0, "bottom": [9, 300], "top": [9, 9]}
 OTHER_LEG = {"lknee": "rknee", "lankle": "rankle", "ltoe": "rtoe"}
 
 
@@ -224,3 +225,29 @@ def test_without_entries_there_is_no_file(tmp_path: Path) -> None:
     assert not path.exists()
     with pytest.raises(InputError, match="expected a file of corrections"):
         load_corrections(path)
+
+
+@pytest.mark.parametrize(
+    ("by", "entry", "words"),
+    [
+        ("nothing", {"feet": [{"to": 2.0, "foot": "left", "rests": True}]}, "feet: the motion has no world"),
+        ("nothing", {"upright": [EDGE]}, "upright: the motion has no world"),
+        ("telemetry", {"upright": [EDGE]}, "upright: telemetry tells up"),
+        ("points", {"upright": [EDGE]}, ""),
+    ],
+)
+def test_what_is_said_in_vain_is_told(
+    by: str, entry: dict[str, object], words: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracks = scene(1)[1]
+    if by == "nothing":
+        tracks = replace(tracks, background=None)
+    if by == "telemetry":
+        turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+        place = np.tile([0.0, 0.0, 2.0], (FRAMES, 1))
+        tracks = replace(tracks, camera_rotation=np.tile(turn, (FRAMES, 1, 1)), camera_position=place)
+    save_tracks(tmp_path / "walk.npz", tracks)
+    save_corrections(tmp_path / "c.yaml", entry)
+    command = ["reconstruct", str(tmp_path / "walk.npz"), "--quiet", "--no-report", "--out", str(tmp_path / "out")]
+    assert main([*command, "--corrections", str(tmp_path / "c.yaml")]) == 0
+    assert (words in caplog.text) if words else ("changes nothing" not in caplog.text)

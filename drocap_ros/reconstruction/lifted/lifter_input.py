@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from drocap_ros.keypoints import nanmedian_small
 from drocap_ros.skeleton import BODY_17, indices
 
 #: Bones whose lengths are input features: that of joint j to its parent stands at j - 1.
@@ -22,16 +23,6 @@ _TORSO = indices(BODY_17.joints, ("pelvis", "rhip", "lhip", "neck", "lshoulder",
 _CLIP = 6.0
 #: Factor of the training that brings standard deviations (share of the size) to the order of one.
 _STD_FACTOR = 10.0
-
-
-def nanmedian_small(values: np.ndarray, axis: int) -> np.ndarray:
-    """Median that ignores NaN along a short axis; NaN where everything is (no warning, unlike numpy's)."""
-    ordered = np.sort(values, axis=axis)
-    count = np.isfinite(values).sum(axis=axis, keepdims=True)
-    low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=axis)
-    high = np.take_along_axis(ordered, np.minimum(count // 2, values.shape[axis] - 1), axis=axis)
-    median: np.ndarray = np.squeeze(0.5 * (low + high), axis=axis)
-    return median
 
 
 def centre_of(keypoints: np.ndarray) -> np.ndarray:

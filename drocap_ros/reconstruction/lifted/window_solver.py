@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.keypoints import Keypoints2D, difference_noise, nanmedian_small
 from drocap_ros.reconstruction.common.poses import Evidence
 from drocap_ros.reconstruction.lifted.adjustment import (
     AdjustmentProblem,
@@ -21,7 +21,6 @@ from drocap_ros.reconstruction.lifted.adjustment import (
     zoom_model,
 )
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
-from drocap_ros.reconstruction.lifted.lifter_input import nanmedian_small
 from drocap_ros.reconstruction.lifted.network import LiftedMotion
 from drocap_ros.skeleton import BODY_17
 
@@ -134,15 +133,6 @@ def _at_least(covariance: np.ndarray, std: float) -> np.ndarray:
     smallest = middle - np.hypot(half, covariance[..., 1])
     wider: np.ndarray = covariance + np.maximum(std**2 - smallest, 0.0)[..., None] * np.array([1.0, 0.0, 1.0])
     return wider
-
-
-def difference_noise(points: np.ndarray) -> float:
-    """Standard deviation per coordinate of points (F, P, 2), F > 3, from their third difference; 0 = none is seen.
-
-    Motion contributes little to it, errors that last for some frames are underestimated.
-    """
-    third = nanmedian_small(np.abs(np.diff(points, n=3, axis=0)).reshape(-1), axis=0)
-    return float(1.48 / np.sqrt(20) * float(np.nan_to_num(third)))
 
 
 def _gap_noise(gap: np.ndarray, stride: int) -> tuple[float, float]:

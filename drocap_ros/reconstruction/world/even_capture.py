@@ -10,9 +10,8 @@ from drocap_ros.camera_path import CameraPath
 from drocap_ros.contacts import ankles_seen
 from drocap_ros.geometry.interpolation import MAX_GAP_S
 from drocap_ros.geometry.rotations import project_to_so3
-from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.keypoints import Keypoints2D, difference_noise
 from drocap_ros.reconstruction.common.windows import even_slots, fade_weights, windows
-from drocap_ros.reconstruction.lifted.window_solver import difference_noise
 from drocap_ros.reconstruction.world.world_model import PlacedPoses
 
 #: Least images of a part of a recording: with fewer no camera's motion shows.

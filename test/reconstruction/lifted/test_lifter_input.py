@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.reconstruction.lifted.lifter_input import FEATURES, nanmedian_small, normalise
+from drocap_ros.keypoints import nanmedian_small
+from drocap_ros.reconstruction.lifted.lifter_input import FEATURES, normalise
 
 
 def test_median_ignores_nan():
