@@ -1,4 +1,4 @@
-"""Clips: files are dropped or chosen, persons clicked, what is known is said, and the motion is made."""
+"""Clips: the choice of files and of a person, stature, lens and log, and the command that makes the motion."""
 
 from __future__ import annotations
 

@@ -10,24 +10,20 @@ import numpy as np
 from nicegui import events, ui
 
 from drocap_ros.app.jobs import Job
+from drocap_ros.app.skeleton_svg import skeleton_svg
+from drocap_ros.app.timeline import FEET, HEIGHT, ROW, WIDTH, TimeAxis, bars_svg
 from drocap_ros.contacts import rest_spans
 from drocap_ros.corrections import parse_corrections, save_corrections
-from drocap_ros.skeleton import COLOURS, joint_set_of, side_of
+from drocap_ros.skeleton import joint_set_of
 
 if TYPE_CHECKING:
     from drocap_ros.app.desk import Host
     from drocap_ros.app.library import Entry
 
-#: Width of the timeline, height of each of its three rows, and a click's most movement on it, px.
-_WIDTH, _ROW, _CLICK = 1000.0, 28.0, 6.0
-_FEET = ("left", "right")
+#: A click's most movement on the timeline, px.
+_CLICK = 6.0
 #: Size of a drawn joint over the picture's longer side, and distance of a click that takes it, in such sizes.
 _JOINT, _REACH = 1 / 110, 3.0
-
-
-def rgb(colour: tuple[int, int, int]) -> str:
-    """A colour as SVG writes it."""
-    return f"rgb{colour}"
 
 
 class Correct:
@@ -35,7 +31,6 @@ class Correct:
 
     def __init__(self, page: Host, entry: Entry) -> None:
         self._page, self._entry = page, entry
-        self._pictures = page.desk.open_pictures(entry)
         self._said: dict[str, list[Any]] = {kind: list(rows) for kind, rows in entry.corrections().items()}
         self._index = 0
         self._range: tuple[int, int] | None = None
@@ -43,7 +38,8 @@ class Correct:
         self._drag: int | None = None
         self._mode, self._ends = "", list[tuple[float, float]]()
         self._from: tuple[float, int] | None = None  # where the mouse went down on the timeline, and its row
-        self._read()
+        self._read()  # refuses a file that somebody has written
+        self._pictures = page.desk.open_pictures(entry)
         self._build()
         self._draw()
 
@@ -52,14 +48,15 @@ class Correct:
         self._page.desk.close_pictures(self._entry)
 
     def _read(self) -> None:
-        """What is shown of the motion as it is solved now."""
+        """Take the motion as the last solution left it."""
         self._motion, self._tracks = self._entry.motion, self._entry.tracks
         stamp_ns, motion = self._tracks.stamp_ns, self._motion
         self._seconds = (stamp_ns - stamp_ns[0]) * 1e-9
+        self._axis = TimeAxis(self._seconds)
         # One of several persons has tracks in all images, and a motion while it is seen.
         self._rows = np.searchsorted(stamp_ns, motion.stamp_ns).clip(0, len(stamp_ns) - 1)
         rate = 1.0 / max(float(np.median(np.diff(self._seconds))), 1e-3) if len(stamp_ns) > 1 else 30.0
-        ankles = [motion.joints3d[:, motion.joints.index(f"{side[0]}ankle")] for side in _FEET]
+        ankles = [motion.joints3d[:, motion.joints.index(f"{side[0]}ankle")] for side in FEET]
         spans = [rest_spans(ankle, rate) if motion.frame == "world" else [] for ankle in ankles]
         self._rests = [[(self._rows[a], self._rows[b - 1] + 1) for a, b in of_foot] for of_foot in spans]
         source, place = joint_set_of(self._tracks.joints)
@@ -68,8 +65,8 @@ class Correct:
         self._change()
 
     def _change(self) -> None:
-        """Apply what is said to the keypoints that are shown; other persons are as the last solution found them."""
-        self._meant = self._entry.corrected(self._said).keypoints
+        """Apply the corrections to the keypoints in the picture; the last solution has those of other persons."""
+        self._meant = self._entry.corrected(self._said).keypoints.copy()  # a drag moves them
         for span, box in parse_corrections(self._said).person:
             rows = span.of(self._seconds)
             self._meant[rows] = np.nan
@@ -102,7 +99,7 @@ class Correct:
         )
         self._picture.props('data-part="picture"')
         self._timeline = ui.interactive_image(
-            size=(_WIDTH, 3 * _ROW), on_mouse=self._time_mouse, events=["mousedown", "mouseup"], sanitize=False
+            size=(WIDTH, HEIGHT), on_mouse=self._time_mouse, events=["mousedown", "mouseup"], sanitize=False
         )
         self._timeline.classes("w-full").props('data-part="timeline"')
         with ui.row().classes("items-center"):
@@ -140,11 +137,11 @@ class Correct:
         x0, y0, x1, y1 = pictures.boxes[self._index] if close else (0, 0, *pictures.size)
         self._picture.style(f"width: min(100%, {60 * (x1 - x0) / max(y1 - y0, 1):.1f}vh)")
         self._picture.set_content(self._skeleton())
-        self._timeline.set_content(self._bars())
+        self._timeline.set_content(bars_svg(self._axis, self._index, self._range, self._rests, self._said))
         span = (
             ""
             if self._range is None
-            else f"  range {self._time(self._range[0]):.2f} to {self._time(self._range[1]):.2f} s"
+            else f"  range {self._axis.time(self._range[0]):.2f} to {self._axis.time(self._range[1]):.2f} s"
         )
         self._at.text = f"{self._seconds[self._index]:.2f} s, image {self._index}{span}"
         self._show_list()
@@ -158,24 +155,11 @@ class Correct:
         x0, y0, x1, y1 = self._pictures.boxes[self._index]
         longer = max(x1 - x0, y1 - y0) if self._close.value else max(self._pictures.size)
         r = longer * scale * _JOINT
-        out = []
-        for a, b in self._bones:
-            if np.isfinite(at[[a, b]]).all():
-                (ax, ay), (bx, by) = at[a], at[b]
-                colour = rgb(COLOURS[side_of(self._tracks.joints[b], self._tracks.joints)])
-                out.append(
-                    f'<line x1="{ax:.1f}" y1="{ay:.1f}" x2="{bx:.1f}" y2="{by:.1f}" stroke="{colour}"'
-                    f' stroke-width="{0.5 * r:.1f}" stroke-opacity="0.8"/>'
-                )
-        placed = {entry["joint"] for entry in self._said.get("joints", []) if self._image(entry["time"]) == self._index}
-        for joint, (name, (x, y)) in enumerate(zip(self._tracks.joints, at, strict=True)):
-            if np.isfinite([x, y]).all():
-                colour = rgb(COLOURS[side_of(name, self._tracks.joints)])
-                ring = "yellow" if joint == self._joint else "white" if name in placed else "none"
-                out.append(
-                    f'<circle data-joint="{name}" cx="{x:.1f}" cy="{y:.1f}" r="{r:.1f}" fill="{colour}"'
-                    f' stroke="{ring}" stroke-width="{0.5 * r:.1f}"><title>{name}</title></circle>'
-                )
+        placed = {e["joint"] for e in self._said.get("joints", []) if self._axis.image(e["time"]) == self._index}
+        rings = {joint: "white" for joint, name in enumerate(self._tracks.joints) if name in placed}
+        if self._joint is not None:
+            rings[self._joint] = "yellow"
+        out = [skeleton_svg(self._tracks.joints, self._bones, at, r, rings)]
         ends = [(np.array(end) - corner) * scale for end in self._ends]
         if self._mode == "person" and len(ends) == 2:
             (ax, ay), (bx, by) = np.minimum(*ends), np.maximum(*ends)
@@ -185,35 +169,6 @@ class Correct:
             )
         out += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{r:.1f}" fill="yellow"/>' for x, y in ends]
         return "".join(out)
-
-    def _bars(self) -> str:
-        """The timeline: images and the range, then the rests of each foot, and what is said of them."""
-        out = [f'<rect width="{_WIDTH}" height="{3 * _ROW}" fill="#8882"/>']
-        if self._range is not None:
-            a, b = (self._x(i) for i in self._range)
-            out.append(f'<rect x="{a:.1f}" width="{max(b - a, 2):.1f}" height="{_ROW}" fill="#fc08"/>')
-        for kind in ("joints", "hidden", "sides", "person", "upright"):
-            for entry in self._said.get(kind, []):
-                a = self._x(self._image(entry.get("time", entry.get("from", 0.0))))
-                b = self._x(self._image(entry.get("time", entry.get("to", self._seconds[-1]))))
-                out.append(f'<rect x="{a:.1f}" y="{_ROW - 6}" width="{max(b - a, 3):.1f}" height="6" fill="#e80"/>')
-        for row, (foot, spans) in enumerate(zip(_FEET, self._rests, strict=True), start=1):
-            colour = rgb(COLOURS[foot])
-            for a, b in spans:
-                out.append(self._bar(row, a, b - 1, f'fill="{colour}" fill-opacity="0.6"'))
-            for entry in self._said.get("feet", []):
-                if entry["foot"] == foot:
-                    a, b = (self._image(entry[end]) for end in ("from", "to"))
-                    fill = "#2a2" if entry["rests"] else "#c33"
-                    out.append(self._bar(row, a, b, f'fill="{fill}" stroke="white"'))
-            out.append(f'<text x="4" y="{_ROW * (row + 0.7)}" font-size="13" fill="currentColor">{foot} foot</text>')
-        x = self._x(self._index)
-        out.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="{3 * _ROW}" stroke="currentColor" stroke-width="2"/>')
-        return "".join(out)
-
-    def _bar(self, row: int, first: int, last: int, style: str) -> str:
-        a, b = self._x(first), self._x(last)
-        return f'<rect x="{a:.1f}" y="{_ROW * row + 4}" width="{max(b - a, 3):.1f}" height="{_ROW - 8}" {style}/>'
 
     def _show_list(self) -> None:
         self._list.clear()
@@ -229,18 +184,6 @@ class Correct:
 
     # Times
 
-    def _time(self, index: int) -> float:
-        return round(float(self._seconds[index]), 4)
-
-    def _image(self, seconds: float) -> int:
-        return int(np.argmin(np.abs(self._seconds - seconds)))
-
-    def _x(self, index: int) -> float:
-        return _WIDTH * index / max(len(self._seconds) - 1, 1)
-
-    def _at_x(self, x: float) -> int:
-        return int(np.clip(round(x / _WIDTH * (len(self._seconds) - 1)), 0, len(self._seconds) - 1))
-
     def _go(self, index: int) -> None:
         self._index = int(np.clip(index, 0, len(self._seconds) - 1))
         self._draw()
@@ -248,9 +191,9 @@ class Correct:
     def _span(self) -> dict[str, float]:
         """The range, or the image that is shown."""
         first, last = self._range or (self._index, self._index)
-        return {"from": self._time(first), "to": self._time(last)}
+        return {"from": self._axis.time(first), "to": self._axis.time(last)}
 
-    # What is said
+    # Corrections
 
     def _say(self, kind: str, entry: dict[str, Any]) -> None:
         self._said.setdefault(kind, []).append(entry)
@@ -263,9 +206,9 @@ class Correct:
         self._draw()
 
     def _place(self, joint: int, at: np.ndarray) -> None:
-        name, time_s = self._tracks.joints[joint], self._time(self._index)
-        kept = [e for e in self._said.get("joints", []) if (e["joint"], self._image(e["time"])) != (name, self._index)]
-        self._said["joints"] = kept
+        name, time_s = self._tracks.joints[joint], self._axis.time(self._index)
+        said, here = self._said.get("joints", []), (name, self._index)
+        self._said["joints"] = [e for e in said if (e["joint"], self._axis.image(e["time"])) != here]
         self._say("joints", {"time": time_s, "joint": name, "at": [round(float(v), 2) for v in at]})
 
     def _choose_joint(self) -> None:
@@ -336,7 +279,9 @@ class Correct:
                 self._ends.append(at)
             if len(self._ends) == 2:
                 (lower, upper), self._ends = sorted(self._ends, key=lambda end: -end[1]), []
-                self._end_mode("upright", {"time": self._time(self._index), "bottom": _px(lower), "top": _px(upper)})
+                self._end_mode(
+                    "upright", {"time": self._axis.time(self._index), "bottom": _px(lower), "top": _px(upper)}
+                )
                 return
         elif kind == "mousedown":
             self._ends = [at, at]
@@ -345,8 +290,8 @@ class Correct:
             if kind == "mouseup":
                 low, high = np.array(self._ends).min(axis=0), np.array(self._ends).max(axis=0)
                 if (high - low).min() > 8:
-                    entry: dict[str, Any] = {"from": self._time(self._index), "box": _px((*low, *high))}
-                    entry |= {} if self._range is None else {"to": self._time(self._range[1])}
+                    entry: dict[str, Any] = {"from": self._axis.time(self._index), "box": _px((*low, *high))}
+                    entry |= {} if self._range is None else {"to": self._axis.time(self._range[1])}
                     self._end_mode("person", entry)
                     return
         self._picture.set_content(self._skeleton())
@@ -356,35 +301,39 @@ class Correct:
         self._say(kind, entry)
 
     def _time_mouse(self, event: events.MouseEventArguments) -> None:
-        row = int(np.clip(event.image_y // _ROW, 0, 2))
+        row = int(np.clip(event.image_y // ROW, 0, 2))
         if event.type == "mousedown":
             self._from = (event.image_x, row)
             return
         if self._from is None:
             return
         (begin, row), self._from = self._from, None
-        first, last = sorted((self._at_x(begin), self._at_x(event.image_x)))
+        first, last = sorted((self._axis.at(begin), self._axis.at(event.image_x)))
         dragged = abs(event.image_x - begin) > _CLICK
         if row == 0:
             self._range = (first, last) if dragged else None
             self._go(first)
         else:
-            self._foot(_FEET[row - 1], first, last if dragged else None)
+            self._foot(FEET[row - 1], first, last if dragged else None)
 
     def _foot(self, foot: str, first: int, last: int | None) -> None:
-        """A drag says that a foot rests; a click on a rest that it does not, on what is said that it is not said."""
+        """Add a rest by a drag; deny a rest by a click on it; take a correction back by a click on that."""
         if last is not None:
-            self._say("feet", {"from": self._time(first), "to": self._time(last), "foot": foot, "rests": True})
+            self._say_of_foot(foot, first, last, rests=True)
             return
         for entry in self._said.get("feet", []):
-            if entry["foot"] == foot and entry["from"] <= self._seconds[first] <= entry["to"]:
+            begin, end = self._axis.span(entry)
+            if entry["foot"] == foot and begin <= first <= end:
                 self._remove("feet", entry)
                 return
-        for a, b in self._rests[_FEET.index(foot)]:
+        for a, b in self._rests[FEET.index(foot)]:
             if a <= first < b:
-                self._say("feet", {"from": self._time(a), "to": self._time(b - 1), "foot": foot, "rests": False})
+                self._say_of_foot(foot, a, b - 1, rests=False)
                 return
         self._go(first)
+
+    def _say_of_foot(self, foot: str, first: int, last: int, *, rests: bool) -> None:
+        self._say("feet", {"from": self._axis.time(first), "to": self._axis.time(last), "foot": foot, "rests": rests})
 
     def _key(self, event: events.KeyEventArguments) -> None:
         if not event.action.keydown:

@@ -50,7 +50,8 @@ class Entry:
     @property
     def tracks(self) -> Tracks:
         """Its tracks before corrections."""
-        return load_tracks(self.folder / "tracks.npz")
+        path = self.folder / "tracks.npz"
+        return _tracks(path, path.stat().st_mtime_ns if path.exists() else 0)
 
     @property
     def report(self) -> Path:
@@ -121,6 +122,11 @@ def motions(folder: Path) -> list[Entry]:
 @functools.lru_cache(maxsize=8)
 def _motion(path: Path, _changed_ns: int) -> Motion:
     return load_motion(path)
+
+
+@functools.lru_cache(maxsize=2)
+def _tracks(path: Path, _changed_ns: int) -> Tracks:
+    return load_tracks(path)
 
 
 @functools.lru_cache(maxsize=1000)

@@ -70,7 +70,8 @@ class Page:
     def _card(self, entry: Entry) -> None:
         key, chosen = self.desk.key(entry), self.entry is not None and entry.name == self.entry.name
         card = ui.card().classes("w-full p-2 cursor-pointer" + (" chosen" if chosen else ""))
-        card.props(f'tabindex=0 role=listitem data-motion="{entry.name}"')
+        card.props("tabindex=0 role=listitem")
+        card.props["data-motion"] = entry.name
         for event in ("click", "keydown.enter"):
             card.on(event, lambda entry=entry: self.choose(entry))
         with card, ui.row().classes("items-center no-wrap w-full"):
@@ -94,21 +95,19 @@ class Page:
         self.entry = entry
         self._main.clear()
         self.refresh()
-        try:
-            with self._main:
-                with ui.tabs().classes("w-full") as tabs:
-                    names = [ui.tab(name) for name in ("Motion", "Correct", "Export")]
-                with ui.tab_panels(tabs, value=names[0]).classes("w-full grow").props("keep-alive"):
-                    with ui.tab_panel(names[0]).classes("p-0"):
-                        self._frame = ui.html(self._report(), sanitize=False).classes("report")
-                    with ui.tab_panel(names[1]):
-                        correct = Correct(self, entry)
-                    with ui.tab_panel(names[2]):
-                        Exports(self, entry)
-            self._shown.append(correct.close)
-        except DrocapError as error:
-            with self._main:
-                ui.label(str(error)).classes("text-red")
+        with self._main:
+            with ui.tabs().classes("w-full") as tabs:
+                names = [ui.tab(name) for name in ("Motion", "Correct", "Export")]
+            with ui.tab_panels(tabs, value=names[0]).classes("w-full grow").props("keep-alive"):
+                with ui.tab_panel(names[0]).classes("p-0"):
+                    self._frame = ui.html(self._report(), sanitize=False).classes("report")
+                with ui.tab_panel(names[1]):
+                    try:
+                        self._shown.append(Correct(self, entry).close)
+                    except DrocapError as error:
+                        ui.label(str(error)).classes("text-red")
+                with ui.tab_panel(names[2]):
+                    Exports(self, entry)
 
     def _report(self) -> str:
         assert self.entry is not None

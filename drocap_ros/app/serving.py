@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
     from starlette.responses import Response
 
-#: Messages that a page misses while its connection is interrupted; beyond them it is loaded anew.
+#: Messages kept for a page whose connection is interrupted; a page that missed more is loaded anew.
 _KEPT_MESSAGES = 50
 #: Time for open connections at the end, s.
 _CLOSING_S = 1

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
+from drocap_ros.app.skeleton_svg import skeleton_svg
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.skeleton import COLOURS, JointSet, side_of
+from drocap_ros.skeleton import JointSet
 
 #: Points of a bone of the 3D body.
 _BONE_POINTS = 8
@@ -15,23 +14,10 @@ _BONE_POINTS = 8
 _MARGIN, _LEAST_M = 1.15, 8.0
 
 
-def _colour(joint: str, joints: Sequence[str]) -> str:
-    return "rgb({},{},{})".format(*COLOURS[side_of(joint, tuple(joints))])
-
-
 def keypoints_svg(observation: PoseObservation) -> str:
     """Bones and joints over an image, in its pixels."""
-    width = max(observation.image_size) / 300
-    joints, at = observation.joints, observation.keypoints
-    seen = np.isfinite(at).all(axis=1)
-    lines = [
-        f'<line x1="{at[a][0]:.0f}" y1="{at[a][1]:.0f}" x2="{at[b][0]:.0f}" y2="{at[b][1]:.0f}"'
-        f' stroke="{_colour(joints.joints[b], joints.joints)}" stroke-width="{width:.1f}" stroke-linecap="round"/>'
-        for a, b in joints.bones
-        if seen[a] and seen[b]
-    ]
-    dots = [f'<circle cx="{x:.0f}" cy="{y:.0f}" r="{width:.1f}" fill="white" stroke="#333"/>' for x, y in at[seen]]
-    return "".join((*lines, *dots))
+    joints, width = observation.joints, max(observation.image_size)
+    return skeleton_svg(joints.joints, joints.bones.tolist(), observation.keypoints, width / 300)
 
 
 def bearing_svg(image_size: tuple[int, int], bearing_deg: float, speed_deg_s: float) -> str:

@@ -14,6 +14,8 @@ from walking import make_walk
 
 from drocap_ros.app.jobs import Job
 from drocap_ros.app.library import Entry, clips, motions
+from drocap_ros.app.skeleton_svg import skeleton_svg
+from drocap_ros.app.timeline import WIDTH, TimeAxis, bars_svg
 from drocap_ros.cli import main
 from drocap_ros.corrections import save_corrections
 from drocap_ros.motion import load_motion
@@ -118,3 +120,27 @@ def test_the_command_says_what_is_missing(tmp_path: Path, capsys: pytest.Capture
         assert main(["app", str(tmp_path), "--no-browser", "--port", str(taken.getsockname()[1])]) == 2
     assert "expected a free address" in capsys.readouterr().err
     assert main(["app", str(tmp_path), "--no-browser", "--port", "70000"]) == 2
+
+
+def test_the_timeline_draws_what_a_file_by_hand_may_leave_out() -> None:
+    axis = TimeAxis(np.arange(101) / 25.0)
+    said = {
+        "feet": [{"foot": "left", "rests": False}, {"foot": "right", "rests": True, "from": 2.0}],
+        "person": [{"from": 1.0}],
+        "joints": [{"time": 4.0, "joint": "lknee", "at": [1.0, 2.0]}],
+    }
+    assert [axis.span(entry) for entry in said["feet"]] == [(0, 100), (50, 100)]
+    assert axis.at(axis.x(37)) == 37
+    assert axis.at(-50.0) == 0
+    assert axis.at(2 * WIDTH) == 100
+    drawn = bars_svg(axis, 10, (20, 30), [[(5, 40)], []], said)
+    assert drawn.count("#e80") == 2
+    assert drawn.count("#c33") == drawn.count("#2a2") == 1
+
+
+def test_a_name_of_a_file_is_no_markup_of_the_page() -> None:
+    at = np.array([[1.0, 2.0], [np.nan, 3.0], [4.0, 5.0]])
+    drawn = skeleton_svg(('"><script>', "lknee", "rknee"), [(0, 2), (0, 1)], at, 3.0, {2: "white"})
+    assert "<script>" not in drawn
+    assert drawn.count("<circle") == 2
+    assert drawn.count("<line") == 1
