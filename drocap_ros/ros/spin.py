@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
@@ -91,12 +92,15 @@ def lower_priority(niceness: int) -> None:
     """Give all threads of this process, and those that they start, a Unix niceness; from 10 on SCHED_BATCH too."""
     if niceness == 0:
         return
-    # Not every system has priorities of threads.
-    with contextlib.suppress(OSError, AttributeError):
-        for thread in map(int, os.listdir("/proc/self/task")):
-            os.setpriority(os.PRIO_PROCESS, thread, niceness)
-            if niceness >= _BATCH:
-                os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
+    seen: set[str] = set()
+    # A thread may start or end meanwhile; not every system has priorities of threads.
+    while new := {path.name for path in Path("/proc/self/task").glob("*")} - seen:
+        seen |= new
+        for thread in map(int, new):
+            with contextlib.suppress(OSError, AttributeError):
+                os.setpriority(os.PRIO_PROCESS, thread, niceness)
+                if niceness >= _BATCH:
+                    os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
 
 
 def node_main(node_class: type[ComponentNode]) -> int:

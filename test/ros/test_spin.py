@@ -9,9 +9,11 @@ import pytest
 from drocap_ros.ros.topics import NODES
 
 SCRIPT = """
-import os, sys, threading
+import os, sys, threading, time
 from drocap_ros.ros.spin import lower_priority
 before, release = threading.Event(), threading.Event()
+for _ in range(300):  # others end meanwhile
+    threading.Thread(target=time.sleep, args=(0.01,)).start()
 thread = threading.Thread(target=release.wait, daemon=True)
 thread.start()
 lower_priority(int(sys.argv[1]))

@@ -84,9 +84,13 @@ def test_unknown_node_is_refused():
 def test_priority_of_a_process_follows_the_table_in_the_session_and_out_of_the_group_of_the_command(tmp_path):
     with bringup(short_flight(tmp_path), [*CAPTURE, "visualizer"], processes=True) as graph:
         drawing, simulator = graph.pid("visualizer"), graph.pid("session_player")
-        graph.wait_until(lambda: os.sched_getscheduler(drawing) == os.SCHED_BATCH, 20, "the visualizer's priority")
-        threads = [int(path.name) for path in Path(f"/proc/{drawing}/task").iterdir()]
-        assert min(os.getpriority(os.PRIO_PROCESS, thread) for thread in threads) == NODES["visualizer"].niceness
+        threads, niceness = Path(f"/proc/{drawing}/task"), NODES["visualizer"].niceness
+        graph.wait_until(  # one thread after the other
+            lambda: all(os.getpriority(os.PRIO_PROCESS, int(path.name)) == niceness for path in threads.iterdir()),
+            20,
+            "the visualizer's priority",
+        )
+        assert os.sched_getscheduler(drawing) == os.SCHED_BATCH
         assert os.sched_getscheduler(simulator) == os.SCHED_OTHER
         assert os.getpriority(os.PRIO_PROCESS, simulator) == os.getpriority(os.PRIO_PROCESS, 0)
         # Niceness acts within a session only; Ctrl-C reaches the command's process group only.
