@@ -47,9 +47,12 @@ class SubjectChoice:
         last : the last subject, predicted over ``coast_s``; shape : of the image
         first : whether there was no subject yet; then a person whose poses are not believable can be chosen
         """
-        if self._waits(last, stamp_ns, coast_s, first):
+        waits = self._waits(last, stamp_ns, coast_s, first)
+        if waits and (last is None or not last.nobody):
             return None
-        if last is not None and not last.left_image:
+        if waits:  # whoever certainly is a person does not wait for clutter
+            persons = [p for p in persons if p.pose.established]
+        elif last is not None and not last.left_image:
             persons = certainly_others(last, persons, stamp_ns)
         persons = [p for p in persons if p is not last and p.detected_ns == stamp_ns]
         # One who is about to be confirmed is waited for.
@@ -74,7 +77,7 @@ class SubjectChoice:
         # Whoever was followed for a moment is not waited for much longer.
         followed_s = (last.confirmed_ns - last.first_ns) * 1e-9
         longest_s = 0.0 if last.left_image else coast_s + min(DOUBT_S, followed_s)
-        return waits or last.unconfirmed_s(stamp_ns) <= longest_s
+        return (waits and last.pose.established) or last.unconfirmed_s(stamp_ns) <= longest_s
 
     def _confirmed(self, person: Person, first: bool) -> bool:
         """Whether enough images show the person; at the beginning a certain detection is enough."""

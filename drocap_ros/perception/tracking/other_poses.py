@@ -53,19 +53,20 @@ class OtherPoses:
 
 
 def due_bystanders(tracker: SubjectTracker, stamp_ns: int, shedding: bool = False) -> list[Person]:
-    """Persons detected in this image whose poses are due, the oldest first, beside a certain subject or without one.
+    """Persons detected in this image whose poses are due, the oldest first, beside a certain subject, clutter or nobody.
 
     shedding : only those who are not yet known to be someone else
     """
     subject = tracker.subject
     searching = subject is None or subject.detected_ns != stamp_ns
-    if subject is not None and not searching and subject.pose.believed_ns != stamp_ns:
+    choosing = subject is None or subject.nobody
+    if subject is not None and not (searching or choosing) and subject.pose.believed_ns != stamp_ns:
         return []
     known = subject.others if shedding and subject is not None else ()
     due = [
         p
         for p in tracker.detected(stamp_ns)
-        if p not in known and _due(p, searching or not tracker.apart(p), subject is None, stamp_ns)
+        if p not in known and _due(p, searching or not tracker.apart(p), choosing, stamp_ns)
     ]
     return sorted(due, key=lambda p: (p.pose.judged_ns or 0, -p.filter.length))
 

@@ -142,6 +142,9 @@ DOUBT_S = 3.0  # and over which a last detection, or a meeting of two in which t
 #: 0.02 to 0.05, who runs 0.1, two persons' or shadows' 0.1 to 0.4;
 _LIMBS = 0.08
 _LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn and stoop
+#: Excess of the confidence over a believable one that makes a person, summed up over the poses, those below it taken off:
+#: of three clear poses or ten doubtful ones.  Clutter and shadows are believable by chance, and not for long.
+_ESTABLISHED = 1.0
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
 _LONG_AGO_NS = 10**18
 #: First, least and largest recent share of detections of a person, and the weight of a new image in it.
@@ -170,6 +173,7 @@ class PoseBelief:
         self.usual = 0.0
         self._limbs: np.ndarray | None = None
         self._poses = 0
+        self._support, self._established = 0.0, False
         self._failing_ns: int | None = None
 
     def judge(
@@ -188,8 +192,10 @@ class PoseBelief:
         first = np.isnan(self.value) or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
         self.value = confidence if first else self.value + _RECENT_RATE * (confidence - self.value)
         self.last, self.judged_ns = confidence, stamp_ns
+        self._support = max(self._support + confidence - CONFIRM_CONFIDENCE, 0.0)
+        self._established |= self._support >= _ESTABLISHED
         if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self.usual):
-            self.choose(box, stamp_ns)
+            self._believe(box, stamp_ns)
             self.usual = confidence if not self.usual else self.usual + SLOW_RATE * (confidence - self.usual)
             if limbs is not None:
                 self._poses += 1
@@ -214,6 +220,10 @@ class PoseBelief:
 
     def choose(self, box: np.ndarray, stamp_ns: int) -> None:
         """Believe a box (4,) px that a user or a drone's tracker gave, whatever its pose."""
+        self._believe(box, stamp_ns)
+        self._established = True
+
+    def _believe(self, box: np.ndarray, stamp_ns: int) -> None:
         self.believed_ns, self.box, self._failing_ns = stamp_ns, np.array(box, float), None
         if self.plausible_ns is None:
             self.plausible_ns, self.began = stamp_ns, self.box
@@ -233,6 +243,11 @@ class PoseBelief:
         """Mark the track as no person, by a pose that lost against another one."""
         self.value, self.last, self.judged_ns, self.plausible_ns = confidence, confidence, stamp_ns, None
         self._failing_ns = stamp_ns
+
+    @property
+    def established(self) -> bool:
+        """Whether it was a person beyond chance; a track without poses is believed."""
+        return self._established or self.judged_ns is None
 
     @property
     def believed(self) -> bool:
@@ -322,6 +337,11 @@ class Person:
     def plausible(self) -> bool:
         """Whether its poses leave it to be a person."""
         return self.pose.plausible_ns is not None
+
+    @property
+    def nobody(self) -> bool:
+        """Whether it is clutter that was taken for a person."""
+        return not (self.pose.established or self.plausible)
 
     @property
     def moves(self) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from test_subject_tracking import BLUE, RED, SIZE, STEP, Scene, offset
@@ -278,3 +280,28 @@ def test_subject_that_comes_out_where_someone_else_went_in_is_found():
 def test_someone_else_who_comes_out_again_is_not_the_subject():
     scene = seen_together(BLUE)
     assert {scene.show([(490 + 2 * t, 180, 160, BLUE)]) for t in range(8)} == {None}
+
+
+@pytest.mark.parametrize("on_loss", ["wait", "next"])
+@pytest.mark.parametrize("seed", range(12))
+def test_clutter_that_was_taken_for_a_person_does_not_keep_the_person_away(seed, on_loss):
+    """Its first poses are believable by chance; the person comes into view before, with or after it."""
+    rng = np.random.default_rng(seed)
+    scene, came, chance, height = Scene(on_loss=on_loss), rng.integers(0, 30), rng.integers(1, 4), rng.uniform(80, 160)
+    clutter, there, taken = (450, 180, 1.3 * height), (200, 180, height, RED), []
+    for i in range(60 + came):
+        persons = [there] if i >= came else []
+        boxes = [(box_of(*clutter), rng.uniform(0.35, 0.6))] if i >= 10 else []
+        boxes += [(box_of(*there[:3]) + rng.normal(0, 1, 4), rng.uniform(0.36, 0.7)) for _ in persons]
+        subject, stamp = scene.show(persons, detections=boxes), scene.index * STEP - STEP
+        poses = {
+            450.0: rng.uniform(0.51, 0.65) if i < 10 + chance else rng.uniform(0.1, 0.45),
+            200.0: rng.normal(0.8, 0.06),
+        }
+        if subject is not None and subject.score > 0:
+            judged(scene, poses[450.0 if offset(subject, 450) < 50 else 200.0], subject)
+        for other in due_bystanders(scene.tracker, stamp)[:2]:
+            scene.tracker.judge_bystander(other, poses[450.0 if other.box[0] > 300 else 200.0], stamp)
+        taken.append(subject is not None and offset(subject, 200) < 20)
+    assert all(taken[-20:])
+    assert all(later or not before for before, later in pairwise(taken))  # never left again

@@ -46,7 +46,10 @@ class Scene:
         boxes = boxes[seen] + self.rng.normal(0, 1.0, (len(seen), 4))
         score = np.array([(scores or {}).get(i, 0.8) for i in seen])
         if detections is not None:
-            boxes, score = np.array([box for box, _ in detections], float), np.array([s for _, s in detections])
+            boxes, score = (
+                np.array([box for box, _ in detections], float).reshape(-1, 4),
+                np.array([s for _, s in detections]),
+            )
         stamp = self.index * STEP
         self.index += 1
         return self.tracker.update(image, stamp, boxes, score, roi)
