@@ -53,7 +53,7 @@ class OtherPoses:
 
 
 def due_bystanders(tracker: SubjectTracker, stamp_ns: int, shedding: bool = False) -> list[Person]:
-    """Persons detected in this image whose poses are due, the oldest first, beside a certain subject, clutter or nobody.
+    """Persons detected in this image whose poses are due, the oldest first; none beside a subject in doubt.
 
     shedding : only those who are not yet known to be someone else
     """
@@ -62,11 +62,12 @@ def due_bystanders(tracker: SubjectTracker, stamp_ns: int, shedding: bool = Fals
     choosing = subject is None or subject.nobody
     if subject is not None and not (searching or choosing) and subject.pose.believed_ns != stamp_ns:
         return []
+    closely = searching or (subject is not None and tracker.choice.is_open(subject, stamp_ns))
     known = subject.others if shedding and subject is not None else ()
     due = [
         p
         for p in tracker.detected(stamp_ns)
-        if p not in known and _due(p, searching or not tracker.apart(p), choosing, stamp_ns)
+        if p not in known and _due(p, closely or not tracker.apart(p), choosing, stamp_ns)
     ]
     return sorted(due, key=lambda p: (p.pose.judged_ns or 0, -p.filter.length))
 

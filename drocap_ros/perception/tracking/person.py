@@ -142,8 +142,8 @@ DOUBT_S = 3.0  # and over which a last detection, or a meeting of two in which t
 #: 0.02 to 0.05, who runs 0.1, two persons' or shadows' 0.1 to 0.4;
 _LIMBS = 0.08
 _LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn and stoop
-#: Excess of the confidence over a believable one that makes a person, summed up over the poses, those below it taken off:
-#: of three clear poses or ten doubtful ones.  Clutter and shadows are believable by chance, and not for long.
+#: Sum of the confidence's excess over a believable one, at least 0, from which a track is a person: three clear poses
+#: or ten doubtful ones.  Clutter and shadows are believable by chance, and not for long.
 _ESTABLISHED = 1.0
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
 _LONG_AGO_NS = 10**18
@@ -156,7 +156,7 @@ class PoseBelief:
 
     length : px, usual longer side of the believable boxes; partly hidden persons have shorter ones
     value, last : recent mean of the confidence, and that of the last pose; NaN before the first one
-    usual : mean confidence of the believable poses
+    judged, mean : number of poses, and the mean of all; usual : mean confidence of the believable poses
     judged_ns : last pose; believed_ns, box : last believable one and its box (4,) px, None = none yet
     plausible_ns, began : from when on the track was a person, as far as its poses show, and its box (4,) px then, which
         follows the camera; None = it is none
@@ -174,6 +174,7 @@ class PoseBelief:
         self._limbs: np.ndarray | None = None
         self._poses = 0
         self._support, self._established = 0.0, False
+        self.mean, self.judged = 0.0, 0
         self._failing_ns: int | None = None
 
     def judge(
@@ -192,6 +193,8 @@ class PoseBelief:
         first = np.isnan(self.value) or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
         self.value = confidence if first else self.value + _RECENT_RATE * (confidence - self.value)
         self.last, self.judged_ns = confidence, stamp_ns
+        self.judged += 1
+        self.mean += (confidence - self.mean) / self.judged
         self._support = max(self._support + confidence - CONFIRM_CONFIDENCE, 0.0)
         self._established |= self._support >= _ESTABLISHED
         if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self.usual):

@@ -305,3 +305,30 @@ def test_clutter_that_was_taken_for_a_person_does_not_keep_the_person_away(seed,
         taken.append(subject is not None and offset(subject, 200) < 20)
     assert all(taken[-20:])
     assert all(later or not before for before, later in pairwise(taken))  # never left again
+
+
+@pytest.mark.parametrize("other", ["shadow", "person"])
+@pytest.mark.parametrize("seed", range(10))
+def test_somebody_whose_shadow_was_chosen_is_chosen_instead_and_nobody_who_stands_beside(seed, other):
+    """Poses on a shadow are nearly as believable as the person's, at first."""
+    rng = np.random.default_rng(seed)
+    scene, height, side = Scene(), rng.uniform(60, 140), rng.choice([-1, 1])
+    x = 300 + side * 0.3 * height
+    chosen, beside = (300, 180, 1.12 * height, BLUE), (x, 180, height, RED)
+    ids = []
+    for i in range(90):
+        boxes = [(box_of(*who[:3]) + rng.normal(0, 1, 4), rng.uniform(0.4, 0.7)) for who in (chosen, beside)]
+        subject, stamp = scene.show([chosen, beside], detections=boxes), scene.index * STEP - STEP
+        poses = [rng.normal(0.82 if other == "person" or i < 3 else 0.66, 0.06), rng.normal(0.83, 0.06)]
+
+        def nearest(box):
+            return int(abs(box[[0, 2]].mean() - x) < abs(box[[0, 2]].mean() - 300))
+
+        if subject is not None:
+            judged(scene, poses[nearest(subject.box)], subject)
+            ids.append(nearest(subject.box))
+        for bystander in due_bystanders(scene.tracker, stamp)[:2]:
+            scene.tracker.judge_bystander(bystander, poses[nearest(bystander.box)], stamp)
+    if other == "shadow":
+        assert set(ids[60:]) == {1}
+    assert sum(a != b for a, b in pairwise(ids)) <= (other == "shadow")
