@@ -145,6 +145,7 @@ _LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn 
 #: Sum of the confidence's excess over a believable one, at least 0, from which a track is a person: three clear poses
 #: or ten doubtful ones.  Clutter and shadows are believable by chance, and not for long.
 _ESTABLISHED = 1.0
+_NOBODY = 2.0  # sum of what its poses lack, from which a track that was never established is nobody
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
 _LONG_AGO_NS = 10**18
 #: First, least and largest recent share of detections of a person, and the weight of a new image in it.
@@ -343,8 +344,9 @@ class Person:
 
     @property
     def nobody(self) -> bool:
-        """Whether it is clutter that was taken for a person."""
-        return not (self.pose.established or self.plausible)
+        """Whether it is clutter that was taken for a person; poses of somebody in bad light are nearly believable."""
+        lack = self.pose.judged * (CONFIRM_CONFIDENCE - self.pose.mean)
+        return not (self.pose.established or self.plausible) and lack > _NOBODY
 
     @property
     def moves(self) -> bool:

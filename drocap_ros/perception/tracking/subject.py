@@ -376,7 +376,7 @@ class SubjectTracker:
         best = self.choice.by_rule(self.persons, self.subject, image.shape, stamp_ns, self._coast_s, first)
         if best is None:
             return
-        if self.subject is not None and self.current(stamp_ns) is None and self.subject.pose.established:
+        if self.subject is not None and self.current(stamp_ns) is None and not self.subject.nobody:
             self.persons.remove(self.subject)
             self._away.append((self._track_id, self.subject))
         self._follow(best, Change.CHOSEN)
