@@ -31,7 +31,7 @@ BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "leg_sides", "camera_path", "geometry", "keypoints",
      "stamps", "background", "tracks", "corrections", "motion", "clip", "contacts", "file_kind", "open_images",
      "api", "config", "pipeline", "people", "live_replay"): 4.59,  # points of the scene; corrections (0.38); lenses
-    ("perception",): 6.6,  # points of the scene; one who is followed live, and everybody in a recording
+    ("perception",): 6.59,  # points of the scene; one who is followed live, and everybody in a recording
     ("reconstruction",): 12.54,  # one engine, one camera; paths by points, live windows; lenses of joined views (0.09)
     ("flight",): 9.17,  # a process that holds after the bridge's death; preflight, of the machine too; heights
     ("recording",): 6.44,  # keypoints of any order (0.45), tables, GPX, GPMF, several in a log; damaged recordings
