@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import shutil
 import tempfile
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import events, ui
 
+from drocap_ros.app.desk import tell
 from drocap_ros.app.jobs import Job
 from drocap_ros.app.library import clips
 from drocap_ros.perception.load_models import models_folder
@@ -64,26 +66,25 @@ class Clips:
     async def _keep(self, event: events.UploadEventArguments) -> None:
         """Save a file into the folder; one of its name stays, and the new one gets a number."""
         folder, name = self._page.desk.folder, Path(event.file.name.replace("\\", "/")).name
-        path = next(
-            path
-            for number in range(1, 10_000)
-            if not (
-                path := folder / (name if number == 1 else f"{Path(name).stem}_{number}{Path(name).suffix}")
-            ).exists()
-        )
-        await event.file.save(path)
+        path = _free(folder / name)
+        try:
+            await event.file.save(path)
+        except OSError as error:
+            tell(f"{name}: cannot be kept in {folder}: {error.strerror}", "negative")
+            return
         self.refresh()
         if path.name in self._files.options:
             self._files.set_value([*(self._files.value or []), path.name])
         elif path.name in self._log.options:
             self._log.set_value(path.name)
         else:
-            ui.notify(f"{path.name}: expected a video or a flight log, found neither", type="warning")
+            path.unlink()
+            tell(f"{name}: expected a video or a flight log, found neither")
 
     def _chosen(self) -> list[Path]:
         names = self._files.value or []
         if not names:
-            ui.notify("expected a video, found none chosen; drop or choose one", type="warning")
+            tell("expected a video, found none chosen; drop or choose one")
         return [self._page.desk.folder / name for name in names]
 
     def _models(self) -> list[str]:
@@ -122,7 +123,7 @@ class Clips:
         with self._persons:
             for number, jpeg in {**pictures, "all": b""}.items():
                 button = ui.button(on_click=lambda number=number: choose(number)).props(
-                    f'outline role=radio aria-label="person {number}" data-person="{number}"'
+                    f'outline stack padding=xs role=radio aria-label="person {number}" data-person="{number}"'
                 )
                 buttons[number] = button
                 with button:
@@ -136,11 +137,20 @@ class Clips:
         chosen = self._chosen()
         if not chosen:
             return
-        out = chosen[0].with_name(f"{chosen[0].stem}_motion")
+        out = _free(chosen[0].with_name(f"{chosen[0].stem}_motion"))  # an older one may hold somebody's corrections
         words = ["reconstruct", *map(str, chosen), "--out", str(out), *self._models()]
         words += ["--together"] if len(chosen) > 1 else []
         words += ["--all"] if self._person == "all" else ["--subject", self._person] if self._person else []
         words += ["--height", f"{self._height.value:g}"] if self._height.value else []
         words += ["--fov", f"{self._fov.value:g}"] if self._fov.value else []
         words += ["--telemetry", str(self._page.desk.folder / self._log.value)] if self._log.value else []
-        await self._page.work(Job(words), self._page.show_newest)
+        if await self._page.work(Job(words)):
+            self._page.show_newest()
+
+
+def _free(path: Path) -> Path:
+    """The path, with a number where something has its name."""
+    return next(
+        free for number in itertools.count(1)
+        if not (free := path if number == 1 else path.with_stem(f"{path.stem}_{number}")).exists()
+    )  # fmt: skip

@@ -51,7 +51,7 @@ class Exports:
         ending, *kind = form.split("-")
         with tempfile.TemporaryDirectory(prefix="drocap_app_") as folder:
             out = Path(folder) / ".".join([self._entry.name.replace("/", "_"), *kind, ending])
-            words = ["export", str(self._entry.folder), "--to", form, "--out", str(out)]
+            words = ["export", str(self._entry.file), "--to", form, "--out", str(out)]
             if form in RIGGED:
                 words += ["--names", str(self._names.value), "--rest", str(self._rest.value)]
             words += ["--smooth", f"{self._smooth.value:g}"] if self._smooth.value else []

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import secrets
 import socket
 import threading
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
 from drocap_ros.app.clips import Clips
 from drocap_ros.app.correct import Correct
-from drocap_ros.app.desk import Desk
+from drocap_ros.app.desk import Desk, tell
 from drocap_ros.app.exports import Exports
 from drocap_ros.app.jobs import Job
 from drocap_ros.app.library import Entry, motions
 from drocap_ros.app.serving import serve
 from drocap_ros.errors import DrocapError
-
-if TYPE_CHECKING:
-    from fastapi import FastAPI
 
 
 class Page:
@@ -32,14 +26,13 @@ class Page:
     def __init__(self, desk: Desk) -> None:
         self.desk = desk
         self.entry: Entry | None = None
-        self._shown: list[Callable[[], None]] = []
         ui.add_css(_STYLE)
         with ui.header().classes("items-center justify-between py-1"):
             ui.label("drocap").classes("text-lg font-bold")
             ui.label(str(desk.folder)).classes("text-sm opacity-80")
             self._dark = ui.dark_mode(None)
-            ui.button(icon="contrast", on_click=self._dark.toggle).props("flat round dense color=white").tooltip(
-                "light or dark"
+            ui.button(icon="contrast", on_click=self._dark.toggle).props(
+                'flat round dense color=white aria-label="light or dark"'
             )
         with ui.element("div").classes("desk"):
             with ui.column().classes("side"):
@@ -48,8 +41,10 @@ class Page:
                 self._library = ui.column().classes("w-full gap-2").props('role=list aria-label="motions"')
                 self._said = ui.label().classes("said").props('aria-live=polite data-part="said"')
             self._main = ui.column().classes("main")
-        ui.context.client.on_delete(self._leave)
+        self._client = ui.context.client
         self.refresh()
+        for job in desk.jobs:
+            self._watch(job)
         if found := motions(desk.folder):
             self.choose(found[0])
         else:
@@ -91,7 +86,6 @@ class Page:
 
     def choose(self, entry: Entry) -> None:
         """Show a motion."""
-        self._leave()
         self.entry = entry
         self._main.clear()
         self.refresh()
@@ -103,11 +97,17 @@ class Page:
                     self._frame = ui.html(self._report(), sanitize=False).classes("report")
                 with ui.tab_panel(names[1]):
                     try:
-                        self._shown.append(Correct(self, entry).close)
+                        Correct(self, entry)
                     except DrocapError as error:
-                        ui.label(str(error)).classes("text-red")
+                        ui.label(str(error)).classes("text-negative")
+                        if entry.corrections_file.exists():
+                            ui.button("Delete the corrections", on_click=lambda: self._without_corrections(entry))
                 with ui.tab_panel(names[2]):
                     Exports(self, entry)
+
+    def _without_corrections(self, entry: Entry) -> None:
+        entry.corrections_file.unlink(missing_ok=True)
+        self.choose(entry)
 
     def _report(self) -> str:
         assert self.entry is not None
@@ -119,14 +119,8 @@ class Page:
         self._frame.set_content(self._report())
         self.refresh()
 
-    def _leave(self) -> None:
-        for close in self._shown:
-            with contextlib.suppress(OSError):
-                close()
-        self._shown.clear()
-
-    async def work(self, job: Job, done: Callable[[], Any] | None = None) -> bool:
-        """Run a command with its progress on the page; returns whether it went well."""
+    def _watch(self, job: Job) -> None:
+        """Show the progress of a job, of whichever page, until it ends."""
         with ui.dialog().props("persistent") as dialog, ui.card().classes("w-96"):
             title = ui.label(job.words[0].capitalize()).classes("text-base font-bold")
             bar = ui.linear_progress(0.0, show_value=False).props("instant-feedback")
@@ -134,24 +128,35 @@ class Page:
             ui.button("Cancel", on_click=job.cancel)
 
         def show() -> None:
+            if job.status is not None:
+                timer.cancel()
+                dialog.close()
+                dialog.delete()
+                self.refresh()
+                return
             bar.props("indeterminate" if job.share < 0 else "", remove="" if job.share < 0 else "indeterminate")
             bar.value = max(job.share, 0.0)
-            title.text = f"{job.stage or 'begins'} {100 * max(job.share, 0.0):.0f} %" if job.share >= 0 else "begins"
+            title.text = f"{job.stage} {100 * job.share:.0f} %" if job.share >= 0 else job.stage or "begins"
 
         timer = ui.timer(0.2, show)
         dialog.open()
+
+    async def work(self, job: Job) -> bool:
+        """Run a command with its progress on the page; returns whether it went well."""
+        self.desk.jobs.append(job)
+        self._watch(job)
         try:
             status = await job.run()
         finally:
-            timer.cancel()
-            dialog.close()
-            dialog.delete()
+            self.desk.jobs.remove(job)
+        if self._client.is_deleted:  # it was closed meanwhile
+            return False
         self._said.text = "\n".join([job.command, *job.lines])
+        told = [line.removeprefix("drocap: ") for line in job.lines if line.startswith("drocap: ")]
         if status not in (0, 130):
-            words = job.lines[-1] if job.lines else f"ended with status {status}"
-            ui.notify(words, type="negative", position="top", multi_line=True, close_button="Close", timeout=0)
-        if status == 0 and done is not None:
-            done()
+            tell(told[-1] if told else f"{job.command}: ended with status {status}", "negative")
+        elif status == 0 and told:
+            tell("\n".join(told))
         return status == 0
 
 
@@ -159,13 +164,7 @@ def run(folder: Path, models: Path | None, sock: socket.socket, stop: threading.
     """Serve the page until ``stop`` or a signal."""
     desk = Desk(folder, models)
 
-    def build(_: FastAPI) -> None:
-        ui.page("/", title="drocap")(lambda: Page(desk))
-
-    try:
-        serve(build, sock, stop)
-    finally:
-        desk.close()
+    serve(lambda _: ui.page("/", title="drocap")(lambda: Page(desk)), sock, stop)
 
 
 _STYLE = """
@@ -174,7 +173,8 @@ _STYLE = """
 .desk .side { padding: 12px; border-right: 1px solid #8884; overflow: auto; max-height: calc(100vh - 52px); }
 .desk .main { padding: 0 12px 12px; min-width: 0; }
 .chosen { outline: 2px solid var(--q-primary); }
-.thumb { width: 64px; height: 64px; object-fit: cover; border-radius: 4px; background: #8883; }
+.timeline { height: 84px; aspect-ratio: auto !important; }
+.thumb { flex: none; width: 64px; height: 64px; object-fit: cover; border-radius: 4px; background: #8883; }
 .report, .report iframe { width: 100%; height: calc(100vh - 120px); border: 0; }
 .said { white-space: pre-wrap; word-break: break-word; font: 11px monospace; opacity: 0.75; }
 .persons { display: flex; flex-wrap: wrap; gap: 6px; }

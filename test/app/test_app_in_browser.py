@@ -120,6 +120,10 @@ def idle(hand: Hand) -> bool:
     return bool(hand.browser.run("!document.querySelector('.q-linear-progress')"))
 
 
+def corrections_of(folder: Path) -> str:
+    return (folder / "corrections.yaml").read_text()
+
+
 def solve(hand: Hand, motion: Path) -> None:
     before = motion.stat().st_mtime_ns
     hand.press("Solve again")
@@ -226,6 +230,80 @@ def test_another_person_is_meant_from_here_on(folder: Path, hand: Hand) -> None:
     now = load_motion(folder).keypoints[:, :15]
     np.testing.assert_array_equal(now[:10], mine[:10])
     assert np.nanmedian(np.linalg.norm(now[10:] - other[10:], axis=2)) < 6.0
+
+
+def test_up_is_set_by_two_clicks_on_something_that_leans_in_the_picture(folder: Path, hand: Hand) -> None:
+    def roll_deg() -> float:
+        up = load_motion(folder).camera_rotation[0][:, 2]
+        return float(np.degrees(np.arctan2(up[0], -up[1])))
+
+    before = roll_deg()
+    hand.press("Vertical")
+    picture, size = "document.querySelector('[data-part=picture]')", np.array([640.0, 360.0])
+    lean = np.deg2rad(before + 8.0)
+    for along in (-120.0, 120.0):  # px from the middle of the picture
+        at = size / 2 + along * np.array([np.sin(lean), -np.cos(lean)])
+        hand.click(picture, tuple(at / size))
+    solve(hand, folder / "motion.npz")
+    assert hand.clicks <= 8
+    ((lower, upper),) = [(e["bottom"], e["top"]) for e in yaml.safe_load(corrections_of(folder))["upright"]]
+    assert lower[1] > upper[1]
+    assert 3.0 < roll_deg() - before < 10.0
+
+
+def test_corrections_are_kept_by_each_action_for_every_page_and_taken_back(
+    desk: tuple[Path, str], folder: Path, hand: Hand, tmp_path: Path
+) -> None:
+    other = Hand(Browser(tmp_path / "profile"))
+    other.browser.open(desk[1], 1400, 1000)
+    other.press("Correct")
+    try:
+        hand.press("Exchange legs")
+        other.press("Exchange arms")
+        assert [e["limbs"] for e in yaml.safe_load(corrections_of(folder))["sides"]] == ["legs", "arms"]
+        assert "does not follow the corrections yet" in hand.browser.run("document.body.innerText")
+        other.press("Undo")
+        assert [e["limbs"] for e in yaml.safe_load(corrections_of(folder))["sides"]] == ["legs"]
+        (folder / "corrections.yaml").write_text("sides: [{limbs: leg}]")
+        other.press("Exchange all")
+        assert "expected one of legs, arms, all" in other.browser.run("document.body.innerText")
+        other.browser.open(desk[1], 1400, 1000)
+        other.press("Correct")
+        other.press("Delete the corrections")
+        wait(lambda: not (folder / "corrections.yaml").exists(), "no corrections")
+    finally:
+        other.browser.close()
+    hand.press("Undo")
+
+
+def test_a_page_that_is_opened_during_a_job_shows_it(
+    desk: tuple[Path, str], folder: Path, hand: Hand, tmp_path: Path
+) -> None:
+    before, gone = (folder / "motion.npz").stat().st_mtime_ns, Browser(tmp_path / "profile")
+    gone.open(desk[1], 1400, 1000)
+    first = Hand(gone)
+    first.press("Correct")
+    first.press("Solve again")
+    gone.close()
+    hand.browser.open(desk[1], 1400, 1000)
+    wait(lambda: (folder / "motion.npz").stat().st_mtime_ns != before, "another solution")
+    wait(lambda: idle(hand), "the end of its progress")
+    hand.press("Correct")
+
+
+def test_the_keyboard_alone_reaches_every_control(folder: Path, hand: Hand) -> None:
+    hand.press("Exchange legs")
+    assert hand.browser.not_by_keyboard() == []
+    hand.browser.run("document.activeElement.blur()")
+    hand.click("document.querySelector('[data-joint=lknee]')")
+    for key in ("ArrowRight", "[", "ArrowRight", "]", "d", "l"):
+        hand.browser.key(key)
+    said = yaml.safe_load(corrections_of(folder))
+    assert said["feet"] == [{"from": 0.08, "to": 0.16, "foot": "left", "rests": True}]
+    (entry,) = said["joints"]
+    assert entry["time"] == 0.16
+    hand.browser.key("ArrowLeft")
+    hand.browser.key("ArrowLeft")
 
 
 def test_a_motion_is_exported_and_read_back(folder: Path, hand: Hand, tmp_path: Path) -> None:
