@@ -39,7 +39,7 @@ BUDGETS = {
     ("evaluation",): 1.07,  # truth from C3D, TRC and BVH by the names of other programs (0.34), one of several bodies
     ("export", "report", "view"): 4.78,  # OpenSim, USD and FBX (0.17), an avatar's bones live (0.29), several persons
     ("app",): 1.42,  # the page of clips, corrections and exports; by keys, of several persons and cameras
-    ("station",): 0.76,  # one page in a browser for the flight
+    ("station",): 0.75,  # one page in a browser for the flight
     ("ros", "nodes", "bringup"): 5.09,  # lockstep, processes of their own; networks beside optical flow, shared images
     ("cli",): 5.09,  # batch, preflight, top stayed whole; lenses by a chessboard (0.06), several corrected (0.06)
     ("lab", "benchmarks"): 12.26,  # flights that are drawn (0.35), mutants (0.17), heights (0.08), recordings (0.5)

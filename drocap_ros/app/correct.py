@@ -10,8 +10,8 @@ from urllib.parse import quote
 import numpy as np
 from nicegui import events, ui
 
-from drocap_ros.app.desk import tell
-from drocap_ros.app.jobs import Job
+from drocap_ros.app.desk import Desk, tell
+from drocap_ros.app.jobs import Job, Work
 from drocap_ros.app.skeleton_svg import skeleton_svg
 from drocap_ros.app.timeline import FEET, HEIGHT, ROW, WIDTH, TimeAxis, bars_svg
 from drocap_ros.contacts import rest_spans
@@ -21,7 +21,6 @@ from drocap_ros.parameters import Values
 from drocap_ros.skeleton import joint_set_of
 
 if TYPE_CHECKING:
-    from drocap_ros.app.desk import Host
     from drocap_ros.app.library import Entry
 
 #: A click's most movement on the timeline, px.
@@ -40,8 +39,8 @@ _KEYS = (
 class Correct:
     """The part of the page that corrects a motion."""
 
-    def __init__(self, page: Host, entry: Entry) -> None:
-        self._page, self._entry = page, entry
+    def __init__(self, desk: Desk, entry: Entry, work: Work, solved: Callable[[], None]) -> None:
+        self._desk, self._entry, self._work, self._solved = desk, entry, work, solved
         self._said = entry.corrections()
         self._past: list[Values] = []
         self._index = 0
@@ -141,7 +140,7 @@ class Correct:
             blank = f"<svg xmlns='http://www.w3.org/2000/svg' width='{width}' height='{height}'/>"
             self._picture.set_source(f"data:image/svg+xml,{quote(blank)}")
         elif pictures.read > self._index:
-            key = self._page.desk.key(self._entry)
+            key = self._desk.key(self._entry)
             self._picture.set_source(f"/library/{key}/frame/{self._index}?close={int(close)}")
         else:
             self._waiting.activate()
@@ -393,10 +392,10 @@ class Correct:
 
     async def _solve(self) -> None:
         """Solve the motion again from its tracks."""
-        if await self._page.work(Job(self._entry.words(self._page.desk.models))):
+        if await self._work(Job(self._entry.words(self._desk.models))):
             self._read()
             self._draw()
-            self._page.solved()
+            self._solved()
 
 
 def _words(entry: Mapping[str, Any]) -> str:

@@ -1,10 +1,10 @@
-"""What all pages of one server share, and what the parts of a page ask of it."""
+"""What all pages of one server share."""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 from nicegui import app, ui
 from starlette.responses import FileResponse, HTMLResponse, Response
@@ -42,7 +42,7 @@ class Desk:
     def _thumbnail(self, key: str) -> Response:
         entry = self._entries.get(key)
         jpeg = entry.thumbnail if entry else None
-        return Response(jpeg, media_type="image/jpeg") if jpeg else Response(status_code=404)
+        return Response(jpeg, media_type="image/jpeg") if jpeg else Response(status_code=204)
 
     def _frame(self, key: str, index: int, close: int = 0) -> Response:
         entry = self._entries.get(key)
@@ -54,18 +54,3 @@ def tell(words: str, kind: Literal["warning", "negative"] = "warning") -> None:
     """Say something beside the work; what went wrong stays until it has been read."""
     last = 0 if kind == "negative" else 6000
     ui.notify(words, type=kind, position="bottom-left", multi_line=True, close_button="Close", timeout=last)
-
-
-class Host(Protocol):
-    """The page, for its parts."""
-
-    desk: Desk
-
-    async def work(self, job: Job) -> bool:
-        """Run a command with its progress on the page; returns whether it went well."""
-
-    def show_newest(self) -> None:
-        """A motion was made."""
-
-    def solved(self) -> None:
-        """The chosen motion has changed."""

@@ -45,8 +45,9 @@ class Entry:
     @property
     def folder(self) -> Path:
         """What is exported, reported and solved as a whole: of several persons the folder of all."""
-        several = self.file in people_files(self.file.parent.parent).values()
-        return self.file.parent.parent if several else self.file.parent
+        own = self.file.parent
+        several = own.name.startswith("person_") and self.file in people_files(own.parent).values()
+        return own.parent if several else own
 
     @property
     def motion(self) -> Motion:
@@ -135,13 +136,16 @@ class Entry:
 
 
 def motions(folder: Path) -> list[Entry]:
-    """Motions in the folders of a folder, of several persons and as further cameras see them too; the newest first."""
+    """Motions in the folders of a folder, those of the newest folder first; of several persons and cameras each."""
     found = [path for pattern in (f"*/{FILE}", f"*/person_*/{FILE}") for path in folder.glob(pattern)]
     found += [camera for path in found for camera in further_cameras(path.parent)]
     shown = {path.relative_to(folder): path for path in found}
     names = {str(name.parent if path.name == FILE else name.with_suffix("")): path for name, path in shown.items()}
     entries = [Entry(path, name) for name, path in names.items() if not name.startswith(".")]  # one is being written
-    return sorted(entries, key=lambda entry: (-entry.file.stat().st_mtime_ns, entry.name))
+    changed_ns: dict[Path, int] = {}
+    for entry in entries:
+        changed_ns[entry.folder] = max(entry.file.stat().st_mtime_ns, changed_ns.get(entry.folder, 0))
+    return sorted(entries, key=lambda entry: (-changed_ns[entry.folder], entry.name))
 
 
 def further_cameras(folder: Path) -> list[Path]:
