@@ -190,10 +190,9 @@ def _person_at(
         observations = observe(frames, estimator, meter, threads=selection.threads)
     if [o.stamp_ns for o in observations] != stamp_ns.tolist():
         raise InputError(f"{path}: expected the images of these tracks, found others; name the video that they are of")
-    try:
-        return tracks_from_observations(observations)
-    except InputError as error:
-        raise InputError(f"{path}: person: {error}") from None
+    if not subjects(observations):
+        raise InputError(f"{path}: person: expected one in the box {settings.subject_box}, found none; draw it anew")
+    return tracks_from_observations(observations)
 
 
 def input_tracks(

@@ -19,7 +19,8 @@ def videos_of(args: argparse.Namespace, inputs: list[Path]) -> list[Path]:
     """Images of tracks, for each input or for none."""
     from drocap_ros.motion import people_files
 
-    videos: list[Path] = getattr(args, "video", None) or []  # `drocap batch` has none
+    given = args.video or []
+    videos: list[Path] = given if isinstance(given, list) else [given]  # `drocap batch` takes one
     if len(videos) not in (0, len(inputs)):
         raise InputError(f"--video: expected one for each INPUT, {len(inputs)}, found {len(videos)}; name each")
     for video, path in zip(videos, inputs, strict=False):

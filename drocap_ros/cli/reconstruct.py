@@ -64,21 +64,13 @@ def add_parser(subparsers: Subparsers) -> None:
         " times and places against each other are found",
     )
     add_all_option(parser, "one motion each")
-    parser.add_argument(
-        "--video",
-        metavar="FILE",
-        type=Path,
-        action="append",
-        help="with tracks as INPUT, or a folder of person_N/tracks.npz: the images that they are of, for each INPUT;"
-        " the report shows them",
-    )
-    add_options(parser)
+    add_options(parser, videos="append")
     add_threads_option(parser)
     add_quiet_option(parser)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of one reconstruction; ``drocap batch`` has them too."""
+def add_options(parser: argparse.ArgumentParser, videos: str = "store") -> None:
+    """Options of one reconstruction; ``drocap batch`` has them too.  ``videos`` : what a second ``--video`` does."""
     parser.add_argument(
         "--method",
         choices=METHODS,
@@ -152,6 +144,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="order of the joints in a file of keypoints that does not name them, as coco17, h36m17, openpose25 or"
         " mediapipe33 (default: the one that makes a body)",
+    )
+    parser.add_argument(
+        "--video",
+        metavar="FILE",
+        type=Path,
+        action=videos,
+        help="with tracks as INPUT, or a folder of person_N/tracks.npz: the images that they are of, for each INPUT;"
+        " the report shows them",
     )
     parser.add_argument(
         "--corrections",
