@@ -45,7 +45,6 @@ class Correct:
         self._past: list[Values] = []
         self._index = 0
         self._range: tuple[int, int] | None = None
-        self._joint: int | None = None
         self._drag: int | None = None
         self._mode, self._ends = "", list[tuple[float, float]]()
         self._from: tuple[float, int] | None = None  # where the mouse went down on the timeline, and its row
@@ -88,13 +87,14 @@ class Correct:
             self._name = ui.select(
                 dict(enumerate(self._tracks.joints)), label="Joint", on_change=self._choose_joint
             ).classes("w-40")
+            here = "in the range, else in this image"
             tools = (
-                ("Not seen", self._hide, "the chosen joint is not seen in the range"),
-                ("Exchange legs", lambda: self._exchange("legs"), "left and right below the hips, in the range"),
-                ("Exchange arms", lambda: self._exchange("arms"), "left and right below the shoulders, in the range"),
-                ("Exchange all", lambda: self._exchange("all"), "left and right of the body, in the range"),
+                ("Not seen", self._hide, f"the chosen joint is not seen, {here}"),
+                ("Exchange legs", lambda: self._exchange("legs"), f"left and right below the hips, {here}"),
+                ("Exchange arms", lambda: self._exchange("arms"), f"left and right below the shoulders, {here}"),
+                ("Exchange all", lambda: self._exchange("all"), f"left and right of the body, {here}"),
                 ("Another person", lambda: self._begin("person"), "draw a box about who is meant, from here on"),
-                ("Nobody", self._nobody, "the person is not in the picture, in the range"),
+                ("Nobody", self._nobody, f"the person is not in the picture, {here}"),
                 ("Vertical", lambda: self._begin("upright"), "click the lower, then the upper end of an edge"),
             )
             for label, action, words in tools:
@@ -167,8 +167,8 @@ class Correct:
         at, r = (self._meant[self._index] - corner) * scale, self._joint_px() * scale
         placed = {e["joint"] for e in self._said.get("joints", []) if self._axis.image(e["time"]) == self._index}
         rings = {joint: "white" for joint, name in enumerate(self._tracks.joints) if name in placed}
-        if self._joint is not None:
-            rings[self._joint] = "yellow"
+        if self._name.value is not None:
+            rings[self._name.value] = "yellow"
         out = [skeleton_svg(self._tracks.joints, self._bones, at, r, rings)]
         ends = [(np.array(end) - corner) * scale for end in self._ends]
         if self._mode == "person" and len(ends) == 2:
@@ -247,16 +247,15 @@ class Correct:
         )
 
     def _choose_joint(self) -> None:
-        self._joint = self._name.value
-        seen = self._joint is not None and np.isfinite(self._meant[self._index, self._joint]).all()
-        self._hint.text = "" if seen or self._joint is None else "click in the picture where this joint is"
+        seen = self._name.value is not None and np.isfinite(self._meant[self._index, self._name.value]).all()
+        self._hint.text = "" if seen or self._name.value is None else "click in the picture where this joint is"
         self._draw()
 
     def _hide(self) -> None:
-        if self._joint is None:
+        if self._name.value is None:
             self._hint.text = "choose a joint first: click it, or by its name"
             return
-        self._say("hidden", {**self._span(), "joint": self._tracks.joints[self._joint]})
+        self._say("hidden", {**self._span(), "joint": self._tracks.joints[self._name.value]})
 
     def _exchange(self, limbs: str) -> None:
         self._say("sides", {**self._span(), "limbs": limbs})
@@ -285,10 +284,9 @@ class Correct:
         elif event.type == "mousedown":
             self._drag = self._near(at)
             if self._drag is not None:
-                self._joint = self._drag
                 self._name.set_value(self._drag)
-            elif self._joint is not None and np.isnan(self._meant[self._index, self._joint]).any():
-                self._place(self._joint, at)
+            elif self._name.value is not None and np.isnan(self._meant[self._index, self._name.value]).any():
+                self._place(self._name.value, at)
         elif self._drag is not None and event.type == "mousemove" and event.buttons & 1:
             self._meant[self._index, self._drag] = at
             self._picture.set_content(self._skeleton())
@@ -378,10 +376,10 @@ class Correct:
         elif event.key.escape:
             self._mode, self._ends, self._hint.text = "", [], ""
             self._draw()
-        elif name in _MOVES and self._joint is not None:
-            at = self._meant[self._index, self._joint]
+        elif name in _MOVES and self._name.value is not None:
+            at = self._meant[self._index, self._name.value]
             at = at if np.isfinite(at).all() else np.nanmean(self._meant[self._index], axis=0)
-            self._place(self._joint, at + step * np.array(_MOVES[name]))
+            self._place(self._name.value, at + step * np.array(_MOVES[name]))
         elif name in _FEET:
             self._say("feet", {**self._span(), "foot": _FEET[name], "rests": step == 1})
         elif name in ("[", "]"):

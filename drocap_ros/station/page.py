@@ -45,6 +45,8 @@ for (const kind of ["keydown", "keyup"])
   grid-template-columns: repeat(auto-fit, minmax(min(100%%, 26rem), 1fr)); }
 .station > * { min-width: 0; }
 .station > .wide { grid-column: 1 / -1; }
+.old { color: #c10015; }
+.body--dark .old { color: #ff7b7b; }
 .facts { display: grid; grid-template-columns: auto 1fr; gap: 0 0.8rem; width: 100%%; }
 </style>"""
 
@@ -155,7 +157,7 @@ def _facts_html(look: Look) -> str:
     rows = [f"<b>{name}</b><span>{html.escape(words)}</span>" for name, words in look.facts.items()]
     for name, age_s in look.ages.items():
         text = "never" if age_s == float("inf") else f"{age_s:.1f} s ago"
-        old = ' class="text-negative"' if age_s > OLD_S else ""
+        old = ' class="old"' if age_s > OLD_S else ""
         rows.append(f"<b>{name}</b><span{old}>{text}</span>")
     return f'<div class="facts">{"".join(rows)}</div>'
 
