@@ -74,6 +74,13 @@ class Hand:
     def click(self, selector: str, at: tuple[float, float] = (0.5, 0.5)) -> None:
         self.drag(selector, at, at)
 
+    def drop(self, *files: Path) -> None:
+        """Files upon the page."""
+        wait(lambda: self.browser.run("!!document.querySelector('input[type=file]')"), "the place for files")
+        document = self.browser.send("DOM.getDocument")["root"]["nodeId"]
+        node = self.browser.send("DOM.querySelector", nodeId=document, selector="input[type=file]")["nodeId"]
+        self.browser.send("DOM.setFileInputFiles", nodeId=node, files=[str(file) for file in files])
+
     def press(self, label: str) -> None:
         """Click a button or tab by its words."""
         self.click(
@@ -136,10 +143,7 @@ def folder(desk: tuple[Path, str], hand: Hand, tmp_path_factory: pytest.TempPath
     video = tmp_path_factory.mktemp("clip") / "three.avi"
     write_video(video, SCENE)
     browser = hand.browser
-    wait(lambda: browser.run("!!document.querySelector('input[type=file]')"), "the place for files")
-    document = browser.send("DOM.getDocument")["root"]["nodeId"]
-    node = browser.send("DOM.querySelector", nodeId=document, selector="input[type=file]")["nodeId"]
-    browser.send("DOM.setFileInputFiles", nodeId=node, files=[str(video)])
+    hand.drop(video)
     wait(lambda: (desk[0] / "three.avi").exists(), "the clip in the folder")
     time.sleep(1.0)
     hand.press("Find persons")
@@ -289,6 +293,19 @@ def test_a_page_that_is_opened_during_a_job_shows_it(
     wait(lambda: (folder / "motion.npz").stat().st_mtime_ns != before, "another solution")
     wait(lambda: idle(hand), "the end of its progress")
     hand.press("Correct")
+
+
+def test_what_is_no_video_is_refused_and_a_name_that_is_taken_gets_a_number(
+    desk: tuple[Path, str], folder: Path, hand: Hand, tmp_path: Path
+) -> None:
+    (tmp_path / "leer ä b.mp4").touch()
+    (tmp_path / "three.avi").write_bytes((desk[0] / "three.avi").read_bytes())
+    hand.drop(tmp_path / "leer ä b.mp4", tmp_path / "three.avi")
+    words = "leer ä b.mp4: expected a video or a flight log, found neither"
+    wait(lambda: words in hand.browser.run("document.body.innerText"), "a refusal")
+    wait(lambda: (desk[0] / "three_2.avi").exists(), "a copy")
+    assert not (desk[0] / "leer ä b.mp4").exists()
+    (desk[0] / "three_2.avi").unlink()
 
 
 def test_the_keyboard_alone_reaches_every_control(folder: Path, hand: Hand) -> None:
