@@ -1,20 +1,4 @@
-"""What a person corrects by hand in a recording's tracks, and its small YAML file beside the motion.
-
-The file has lists of entries; times are seconds since the recording's first image, places px of its images::
-
-    joints:    # a joint is here
-      - {time: 1.2, joint: lknee, at: [512.0, 300.5]}
-    hidden:    # a joint is not seen
-      - {from: 1.0, to: 1.4, joint: rwrist}
-    sides:     # left and right are exchanged: legs, arms or all
-      - {from: 1.0, to: 2.0, limbs: legs}
-    person:    # this is somebody else: from here the person in the box is meant, without a box nobody
-      - {from: 3.2, box: [300, 100, 420, 480]}
-    feet:      # a foot rests, or does not
-      - {from: 2.0, to: 2.4, foot: left, rests: true}
-    upright:   # something vertical, from its lower to its upper end
-      - {time: 0.0, bottom: [100, 400], top: [104, 80]}
-"""
+"""What a person corrects by hand in a recording's tracks, and its small YAML file beside the motion (docs/app.md)."""
 
 from __future__ import annotations
 
@@ -57,7 +41,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Corrections:
-    """Entries of a file, checked; times in s since the first image, places in px.
+    """Entries of a file, checked; times in s since the first image of the tracks, places in px.
 
     joints : time, name, place; hidden : span and name; sides : span and limbs
     person : span and box or None; feet : span, "left" or "right", whether it rests; upright : time, lower, upper end

@@ -56,6 +56,19 @@ class Motion:
     covariance: np.ndarray | None = None
 
 
+def beside(motion: Path, name: str) -> Path:
+    """The file of a name that belongs to a motion's file; that of a further camera's has its name before."""
+    return motion.with_name(name if motion.name == FILE else f"{motion.stem}_{name}")
+
+
+def people_files(folder: Path, name: str = FILE) -> dict[int, Path]:
+    """Files of a name in the folders ``person_N`` of a folder without a motion of its own, by number."""
+    if not folder.is_dir() or (folder / FILE).exists():
+        return {}
+    files = {path.parent.name.removeprefix("person_"): path for path in folder.glob(f"person_*/{name}")}
+    return {int(number): files[number] for number in sorted(filter(str.isdecimal, files), key=int)}
+
+
 def upright_joints(motion: Motion) -> np.ndarray:
     """(F, P, 3) m, z up: frame "world" unchanged; frame "camera" as x right, y away from the camera, z up.
 

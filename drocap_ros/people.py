@@ -5,25 +5,35 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig
+from drocap_ros.corrections import Corrections
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.motion import Motion
+from drocap_ros.motion import Motion, people_files
 from drocap_ros.open_images import open_images
 from drocap_ros.parameters import Values
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.people import PeopleEstimator, observe_people
 from drocap_ros.perception.sources import Frame
-from drocap_ros.pipeline import COUNTED_S, Selection, needs_networks, with_origin, with_recorded
+from drocap_ros.pipeline import (
+    COUNTED_S,
+    Selection,
+    needs_networks,
+    selected_tracks,
+    tell_said_in_vain,
+    with_corrections,
+    with_origin,
+    with_recorded,
+)
 from drocap_ros.reconstruction.people import reconstruct_people
 from drocap_ros.recording.video_telemetry import Telemetry, read_video_telemetry, with_attitude, with_telemetry
-from drocap_ros.tracks import Tracks
+from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
 
@@ -45,8 +55,6 @@ def track_people(
     They have the numbers of ``drocap track --list``; ``left_out`` of the origin has words about others.
     """
     path = Path(path)
-    if selection.evidence is not None:
-        raise InputError("--evidence: expected one person, found several to reconstruct; choose one with --subject N")
     if not needs_networks(path, selection.redetect):
         raise InputError(f"{path}: expected images for several persons, found 2D poses of one; name the video")
     people = PeopleEstimator(models_folder(models or config.pose_estimator.models_dir), config.pose_estimator)
@@ -60,11 +68,7 @@ def track_people(
 
         frames = Clip(end_s=selection.clip.end_s + COUNTED_S).select(images.frames)
         found = observe_people(frames, people, each, selection.clip, selection.threads)
-    numbers = selection.people or tuple(found)
-    if missing := [number for number in numbers if number not in found]:
-        there = ", ".join(map(str, found))
-        raise InputError(f"--subject {missing[0]}: expected one of {there}; `drocap track --list` numbers the persons")
-    kept, left_out = _long_enough({number: found[number] for number in sorted(numbers)})
+    kept, left_out = _long_enough(_chosen(found, selection.people))
     for words in left_out:
         logger.warning("%s: %s", path, words)
     if not kept:
@@ -109,28 +113,56 @@ def reconstruct_everybody(
 ) -> dict[int, tuple[Motion, Tracks]]:
     """Motions and tracks of everybody in a source's images, or of the selected people, in one world, by their numbers.
 
-    The arguments are those of :func:`~drocap_ros.pipeline.reconstruct_input`.
+    path : as of :func:`~drocap_ros.pipeline.reconstruct_input`, whose arguments the others are, or a folder of
+        ``person_N/tracks.npz``, the tracks of the same images
     """
     path, selection = Path(path), selection or Selection()
     if method == "live":
         raise InputError("--method live: expected a recording of one person's poses; choose another method")
     begin = time.perf_counter()
-    tracks, origin = track_people(path, config, models, selection, progress)
-    seen = {number: int(np.isfinite(t.keypoints).any(axis=(1, 2)).sum()) for number, t in tracks.items()}
-    lead = max(seen, key=lambda number: (seen[number], -number))
-    placed, more = _with_camera_of_input(path, tracks[lead], config, telemetry or Telemetry(), selection, progress)
-    tracks = {number: _with_camera(t, placed) for number, t in tracks.items()}
+    if selection.evidence is not None:
+        raise InputError("--evidence: expected one person, found several to reconstruct; choose one with --subject N")
+    telemetry = telemetry or Telemetry()
+    if files := people_files(path, "tracks.npz"):
+        chosen = _chosen({number: load_tracks(file) for number, file in files.items()}, selection.people)
+        tracks = {number: selected_tracks(own, telemetry, selection) for number, own in chosen.items()}
+        images, size = selection.images, list(next(iter(tracks.values())).image_size)
+        origin: Values = {"people": list(tracks), "left_out": [], "images": {"size": size}}
+    else:
+        images = path
+        tracks, origin = track_people(path, config, models, selection, progress)
+        seen = {number: int(np.isfinite(t.keypoints).any(axis=(1, 2)).sum()) for number, t in tracks.items()}
+        lead = max(seen, key=lambda number: (seen[number], -number))
+        placed, more = _with_camera_of_input(path, tracks[lead], config, telemetry, selection, progress)
+        tracks, origin = {number: _with_camera(t, placed) for number, t in tracks.items()}, origin | more
+    meant = {}
+    for number, own in tracks.items():
+        said = dataclasses.replace(selection, corrections=selection.each_corrections.get(number, Corrections()))
+        meant[number] = with_corrections(images, own, config, models, progress, said)
+        if not np.isfinite(meant[number].keypoints).any():
+            raise InputError(f"{path}: person {number}: expected some images that show it, found none; correct that")
     if selection.rate_hz:
-        tracks = {number: t.at_rate(selection.rate_hz) for number, t in tracks.items()}
+        tracks = {number: own.at_rate(selection.rate_hz) for number, own in tracks.items()}
     seconds = time.perf_counter() - begin
     motions = reconstruct_people(
-        tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
+        meant, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
     found = {}
     for number, motion in motions.items():
-        own: Values = {**origin, **more, "person": number, "seen": when(tracks[number])}
-        found[number] = with_origin(motion, path, own, seconds), tracks[number]
+        told: Values = {**origin, "person": number, "seen": when(meant[number])}
+        if corrections := selection.each_corrections.get(number):
+            told["corrections"] = corrections.values
+            tell_said_in_vain(path, corrections, motion)
+        found[number] = with_origin(motion, path, told, seconds), tracks[number]
     return found
+
+
+def _chosen(people: Mapping[int, Tracks], numbers: Collection[int]) -> dict[int, Tracks]:
+    """Those of these numbers, all without any."""
+    if missing := [number for number in numbers if number not in people]:
+        there = ", ".join(map(str, people))
+        raise InputError(f"--subject {missing[0]}: expected one of {there}; `drocap track --list` numbers the persons")
+    return {number: people[number] for number in sorted(numbers or people)}
 
 
 def _with_camera(tracks: Tracks, placed: Tracks) -> Tracks:

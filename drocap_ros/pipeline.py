@@ -9,7 +9,7 @@ import itertools
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from drocap_ros.corrections import Corrections, corrected, spliced
 from drocap_ros.errors import InputError
 from drocap_ros.file_kind import missing
 from drocap_ros.keypoints import PoseObservation
-from drocap_ros.motion import Motion
+from drocap_ros.motion import Motion, people_files
 from drocap_ros.open_images import open_images, refuse_other_inputs
 from drocap_ros.parameters import Values
 from drocap_ros.perception.calibration import with_lens_of
@@ -62,6 +62,7 @@ class Selection:
     corrections : by hand; their times are those of the motion
     images : of an input that has none
     people : numbers of those whom :mod:`drocap_ros.people` reconstructs; empty = everybody
+    each_corrections : by hand, of people by their numbers
     threads : that share the work on the images; the result is the same with any number
     on_image : called with each image of a video and its pose, in the order of time
     on_tracks : called with the tracks and their origin, as in ``meta`` of the motion, before that is computed
@@ -76,6 +77,7 @@ class Selection:
     corrections: Corrections = field(default_factory=Corrections)
     images: Path | None = None
     people: tuple[int, ...] = ()
+    each_corrections: Mapping[int, Corrections] = field(default_factory=dict)
     threads: int = field(default=2, compare=False)
     on_image: Callable[[Frame, PoseObservation], None] = field(default=lambda *_: None, compare=False)
     on_tracks: Callable[[Tracks, Values], None] = field(default=lambda *_: None, compare=False)
@@ -132,20 +134,17 @@ def reconstruct_input(
     motion = reconstruct(
         meant, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
-    for words in _said_in_vain(selection.corrections, motion):
-        logger.warning("%s: %s", path, words)
+    tell_said_in_vain(Path(path), selection.corrections, motion)
     return with_origin(motion, Path(path), origin, seconds), tracks
 
 
-def _said_in_vain(corrections: Corrections, motion: Motion) -> list[str]:
-    """Words about corrections that the motion could not follow."""
-    words = []
+def tell_said_in_vain(path: Path, corrections: Corrections, motion: Motion) -> None:
+    """Warn of corrections that the motion could not follow."""
     if corrections.feet and motion.frame == "camera":
-        words.append("feet: the motion has no world in which a foot rests; they change nothing")
+        logger.warning("%s: feet: the motion has no world in which a foot rests; they change nothing", path)
     if corrections.upright and (motion.frame == "camera" or "camera" not in motion.meta):
         by = "the motion has no world" if motion.frame == "camera" else "telemetry tells up"
-        words.append(f"upright: {by}; it changes nothing")
-    return words
+        logger.warning("%s: upright: %s; it changes nothing", path, by)
 
 
 def with_corrections(
@@ -191,10 +190,9 @@ def _person_at(
         observations = observe(frames, estimator, meter, threads=selection.threads)
     if [o.stamp_ns for o in observations] != stamp_ns.tolist():
         raise InputError(f"{path}: expected the images of these tracks, found others; name the video that they are of")
-    try:
-        return tracks_from_observations(observations)
-    except InputError as error:
-        raise InputError(f"{path}: person: {error}") from None
+    if not subjects(observations):
+        raise InputError(f"{path}: person: expected one in the box {settings.subject_box}, found none; draw it anew")
+    return tracks_from_observations(observations)
 
 
 def input_tracks(
@@ -227,7 +225,7 @@ def needs_networks(path: Path, redetect: bool) -> bool:
     if not path.exists():
         raise missing(path, "a video, folder of images, recording or tracks file")
     refuse_other_inputs(path)
-    if path.suffix == ".npz":
+    if path.suffix == ".npz" or people_files(path, "tracks.npz"):
         return False
     if redetect or not is_recording(path):
         return True
@@ -251,6 +249,8 @@ def read_input(
         return with_recorded(path, tracks, telemetry, selection), origin | more
     if path.suffix == ".npz":
         return selected_tracks(load_tracks(path), telemetry, selection), origin
+    if people_files(path, "tracks.npz"):
+        raise InputError(f"{path}: expected one person, found tracks of several; add --all, or name those of one")
     if selection.person is not None:
         raise InputError(f"--subject {selection.person}: expected images, found 2D poses of one person; add --redetect")
     with open_session(path) as session:
@@ -374,22 +374,27 @@ def reconstruct_together(
     telemetry: Telemetry,
     models: Path | None = None,
     progress: Progress | None = None,
-    threads: int = 0,
+    selections: Sequence[Selection] | None = None,
 ) -> list[tuple[Motion, Tracks]]:
     """The one motion that several recordings of a person show, as each recording's camera sees it, and their tracks.
 
     paths : inputs of :func:`reconstruct_input`, two at least; the times of the first one's images are those of all
     telemetry : none, or that which the recordings have with them
+    selections : the corrections of each, its images, and threads
     """
     solved: list[Solved] = []
     read: list[tuple[Path, Values, float]] = []
     tracks: list[Tracks] = []
-    for path in paths:
+    selections = selections or [_WHOLE] * len(paths)
+    for path, selection in zip(paths, selections, strict=True):
         begin = time.perf_counter()
-        own, origin = input_tracks(path, config, models, progress, telemetry, Selection(threads=threads))
+        own, origin = input_tracks(path, config, models, progress, telemetry, selection)
+        meant = with_corrections(selection.images or path, own, config, models, progress, selection)
+        if selection.corrections:
+            origin["corrections"] = selection.corrections.values
         read.append((path, origin, time.perf_counter() - begin))
         tracks.append(own)
-        solved.append(solve(own, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress))
+        solved.append(solve(meant, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress))
     begin = time.perf_counter()
     names = [path.name for path in paths]
     motions = join_views(solved, [p.name if names.count(p.name) == 1 else f"{p.parent.name}/{p.name}" for p in paths])
@@ -397,4 +402,6 @@ def reconstruct_together(
     for motion in motions:
         alone = motion.meta["seconds"]
         motion.meta["seconds"] = {**alone, "together": took, "total": alone["total"] + took}
+    for path, selection, motion in zip(paths, selections, motions, strict=True):
+        tell_said_in_vain(path, selection.corrections, motion)
     return [(with_origin(motion, *of), own) for motion, of, own in zip(motions, read, tracks, strict=True)]

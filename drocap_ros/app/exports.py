@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drocap_ros.app.jobs import Job
+from drocap_ros.app.jobs import Job, Work
 from drocap_ros.export import FORMATS, RIGGED
 
 if TYPE_CHECKING:
-    from drocap_ros.app.desk import Host
     from drocap_ros.app.library import Entry
 
 #: Format -> programs that open it.
@@ -32,8 +31,8 @@ OPENED_BY = {
 class Exports:
     """The part of the page that writes a motion for other programs."""
 
-    def __init__(self, page: Host, entry: Entry) -> None:
-        self._page, self._entry = page, entry
+    def __init__(self, entry: Entry, work: Work) -> None:
+        self._entry, self._work = entry, work
         with ui.column().classes("w-full max-w-xl"):
             labels = {form: f"{form}: {facts}" for form, facts in FORMATS.items()}
             self._form = ui.select(labels, label="Format", value="bvh").classes("w-full")
@@ -51,11 +50,11 @@ class Exports:
         ending, *kind = form.split("-")
         with tempfile.TemporaryDirectory(prefix="drocap_app_") as folder:
             out = Path(folder) / ".".join([self._entry.name.replace("/", "_"), *kind, ending])
-            words = ["export", str(self._entry.folder), "--to", form, "--out", str(out)]
+            words = ["export", str(self._entry.file), "--to", form, "--out", str(out)]
             if form in RIGGED:
                 words += ["--names", str(self._names.value), "--rest", str(self._rest.value)]
             words += ["--smooth", f"{self._smooth.value:g}"] if self._smooth.value else []
             words += ["--lock-feet"] if self._lock.value else []
-            if await self._page.work(Job(words)):
+            if await self._work(Job(words)):
                 for path in sorted(Path(folder).iterdir()):  # a model stands beside its motion
                     ui.download.content(path.read_bytes(), path.name)

@@ -8,12 +8,18 @@ import re
 import shlex
 import signal
 import sys
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 #: Lines of a command's output that are kept.
 _MOST_LINES = 200
 #: A line of progress on stderr, as ``DROCAP_PROGRESS`` asks for it, and none on stdout.
 _PROGRESS, _SAID = re.compile(r"(-?\d+\.\d{3}) (.*)"), re.compile(r"(?!)")
+
+
+#: Runs a job with its progress on the page; whether it went well.
+Work: TypeAlias = Callable[["Job"], Awaitable[bool]]
 
 
 @dataclass

@@ -3,80 +3,76 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import secrets
 import socket
 import threading
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
 from drocap_ros.app.clips import Clips
 from drocap_ros.app.correct import Correct
-from drocap_ros.app.desk import Desk
+from drocap_ros.app.desk import Desk, tell
 from drocap_ros.app.exports import Exports
 from drocap_ros.app.jobs import Job
 from drocap_ros.app.library import Entry, motions
 from drocap_ros.app.serving import serve
 from drocap_ros.errors import DrocapError
 
-if TYPE_CHECKING:
-    from fastapi import FastAPI
-
 
 class Page:
     """One browser's page."""
 
     def __init__(self, desk: Desk) -> None:
-        self.desk = desk
-        self.entry: Entry | None = None
-        self._shown: list[Callable[[], None]] = []
+        self._desk = desk
+        self._entry: Entry | None = None
         ui.add_css(_STYLE)
         with ui.header().classes("items-center justify-between py-1"):
             ui.label("drocap").classes("text-lg font-bold")
             ui.label(str(desk.folder)).classes("text-sm opacity-80")
             self._dark = ui.dark_mode(None)
-            ui.button(icon="contrast", on_click=self._dark.toggle).props("flat round dense color=white").tooltip(
-                "light or dark"
+            ui.button(icon="contrast", on_click=self._dark.toggle).props(
+                'flat round dense color=white aria-label="light or dark"'
             )
         with ui.element("div").classes("desk"):
             with ui.column().classes("side"):
-                self._clips = Clips(self)
+                self._clips = Clips(desk, self._work, self._show_newest)
                 ui.label("Motions").classes("text-base font-bold")
                 self._library = ui.column().classes("w-full gap-2").props('role=list aria-label="motions"')
                 self._said = ui.label().classes("said").props('aria-live=polite data-part="said"')
             self._main = ui.column().classes("main")
-        ui.context.client.on_delete(self._leave)
-        self.refresh()
+        self._client = ui.context.client
+        self._refresh()
+        for job in desk.jobs:
+            self._watch(job)
         if found := motions(desk.folder):
-            self.choose(found[0])
+            self._choose(found[0])
         else:
             with self._main:
                 ui.label("Drop a video, or choose one, and press Reconstruct.").classes("text-base opacity-80 p-8")
 
-    def show_newest(self) -> None:
+    def _show_newest(self) -> None:
         """A motion was made."""
-        self.choose(motions(self.desk.folder)[0])
+        self._choose(motions(self._desk.folder)[0])
 
-    def refresh(self) -> None:
+    def _refresh(self) -> None:
         """Show the library as the folder is now."""
         self._library.clear()
         with self._library:
-            for entry in motions(self.desk.folder):
+            for entry in motions(self._desk.folder):
                 self._card(entry)
 
     def _card(self, entry: Entry) -> None:
-        key, chosen = self.desk.key(entry), self.entry is not None and entry.name == self.entry.name
+        key, chosen = self._desk.key(entry), self._entry is not None and entry.name == self._entry.name
         card = ui.card().classes("w-full p-2 cursor-pointer" + (" chosen" if chosen else ""))
         card.props("tabindex=0 role=listitem")
         card.props["data-motion"] = entry.name
         for event in ("click", "keydown.enter"):
-            card.on(event, lambda entry=entry: self.choose(entry))
+            card.on(event, lambda entry=entry: self._choose(entry))
         with card, ui.row().classes("items-center no-wrap w-full"):
             at = f"/library/{key}/thumbnail?{secrets.token_hex(4)}"
-            ui.html(f'<img class="thumb" alt="" onerror="this.style.opacity=0" src="{at}">', sanitize=False)
+            image = f'<img class="thumb" alt="" onerror="this.style.opacity=0" src="{at}">'
+            ui.html(image, sanitize=False).classes("shrink-0")
             with ui.column().classes("gap-0 min-w-0"):
                 ui.label(entry.name).classes("font-bold break-all")
                 quality = ui.label().classes("text-xs opacity-80")
@@ -89,12 +85,11 @@ class Page:
         with card:
             ui.timer(0.0, fill, once=True)
 
-    def choose(self, entry: Entry) -> None:
+    def _choose(self, entry: Entry) -> None:
         """Show a motion."""
-        self._leave()
-        self.entry = entry
+        self._entry = entry
         self._main.clear()
-        self.refresh()
+        self._refresh()
         with self._main:
             with ui.tabs().classes("w-full") as tabs:
                 names = [ui.tab(name) for name in ("Motion", "Correct", "Export")]
@@ -103,30 +98,30 @@ class Page:
                     self._frame = ui.html(self._report(), sanitize=False).classes("report")
                 with ui.tab_panel(names[1]):
                     try:
-                        self._shown.append(Correct(self, entry).close)
+                        Correct(self._desk, entry, self._work, self._solved)
                     except DrocapError as error:
-                        ui.label(str(error)).classes("text-red")
+                        ui.label(str(error)).classes("text-negative")
+                        if entry.corrections_file.exists():
+                            ui.button("Delete the corrections", on_click=lambda: self._without_corrections(entry))
                 with ui.tab_panel(names[2]):
-                    Exports(self, entry)
+                    Exports(entry, self._work)
+
+    def _without_corrections(self, entry: Entry) -> None:
+        entry.corrections_file.unlink(missing_ok=True)
+        self._choose(entry)
 
     def _report(self) -> str:
-        assert self.entry is not None
-        at = f"/library/{self.desk.key(self.entry)}/report?{secrets.token_hex(4)}"
+        assert self._entry is not None
+        at = f"/library/{self._desk.key(self._entry)}/report?{secrets.token_hex(4)}"
         return f'<iframe title="report" src="{at}"></iframe>'
 
-    def solved(self) -> None:
+    def _solved(self) -> None:
         """The chosen motion has changed."""
         self._frame.set_content(self._report())
-        self.refresh()
+        self._refresh()
 
-    def _leave(self) -> None:
-        for close in self._shown:
-            with contextlib.suppress(OSError):
-                close()
-        self._shown.clear()
-
-    async def work(self, job: Job, done: Callable[[], Any] | None = None) -> bool:
-        """Run a command with its progress on the page; returns whether it went well."""
+    def _watch(self, job: Job) -> None:
+        """Show the progress of a job, of whichever page, until it ends."""
         with ui.dialog().props("persistent") as dialog, ui.card().classes("w-96"):
             title = ui.label(job.words[0].capitalize()).classes("text-base font-bold")
             bar = ui.linear_progress(0.0, show_value=False).props("instant-feedback")
@@ -134,24 +129,35 @@ class Page:
             ui.button("Cancel", on_click=job.cancel)
 
         def show() -> None:
+            if job.status is not None:
+                timer.cancel()
+                dialog.close()
+                dialog.delete()
+                self._refresh()
+                return
             bar.props("indeterminate" if job.share < 0 else "", remove="" if job.share < 0 else "indeterminate")
             bar.value = max(job.share, 0.0)
-            title.text = f"{job.stage or 'begins'} {100 * max(job.share, 0.0):.0f} %" if job.share >= 0 else "begins"
+            title.text = f"{job.stage} {100 * job.share:.0f} %" if job.share >= 0 else job.stage or "begins"
 
         timer = ui.timer(0.2, show)
         dialog.open()
+
+    async def _work(self, job: Job) -> bool:
+        """Run a command with its progress on the page; returns whether it went well."""
+        self._desk.jobs.append(job)
+        self._watch(job)
         try:
             status = await job.run()
         finally:
-            timer.cancel()
-            dialog.close()
-            dialog.delete()
+            self._desk.jobs.remove(job)
+        if self._client.is_deleted:  # it was closed meanwhile
+            return False
         self._said.text = "\n".join([job.command, *job.lines])
+        told = [line.removeprefix("drocap: ") for line in job.lines if line.startswith("drocap: ")]
         if status not in (0, 130):
-            words = job.lines[-1] if job.lines else f"ended with status {status}"
-            ui.notify(words, type="negative", position="top", multi_line=True, close_button="Close", timeout=0)
-        if status == 0 and done is not None:
-            done()
+            tell(told[-1] if told else f"{job.command}: ended with status {status}", "negative")
+        elif status == 0 and told:
+            tell("\n".join(told))
         return status == 0
 
 
@@ -159,13 +165,7 @@ def run(folder: Path, models: Path | None, sock: socket.socket, stop: threading.
     """Serve the page until ``stop`` or a signal."""
     desk = Desk(folder, models)
 
-    def build(_: FastAPI) -> None:
-        ui.page("/", title="drocap")(lambda: Page(desk))
-
-    try:
-        serve(build, sock, stop)
-    finally:
-        desk.close()
+    serve(lambda _: ui.page("/", title="drocap")(lambda: Page(desk)), sock, stop)
 
 
 _STYLE = """
@@ -174,6 +174,7 @@ _STYLE = """
 .desk .side { padding: 12px; border-right: 1px solid #8884; overflow: auto; max-height: calc(100vh - 52px); }
 .desk .main { padding: 0 12px 12px; min-width: 0; }
 .chosen { outline: 2px solid var(--q-primary); }
+.timeline { height: 84px; aspect-ratio: auto !important; }
 .thumb { width: 64px; height: 64px; object-fit: cover; border-radius: 4px; background: #8883; }
 .report, .report iframe { width: 100%; height: calc(100vh - 120px); border: 0; }
 .said { white-space: pre-wrap; word-break: break-word; font: 11px monospace; opacity: 0.75; }

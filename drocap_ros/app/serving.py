@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Messages kept for a page whose connection is interrupted; a page that missed more is loaded anew.
 _KEPT_MESSAGES = 50
+#: Where the focus is; Quasar forbids outlines.
+_FOCUS = ":is(:focus-visible, .q-field:has(:focus-visible)) { box-shadow: 0 0 0 3px #3fbdb5 !important; }"
 #: Time for open connections at the end, s.
 _CLOSING_S = 1
 
@@ -74,7 +76,7 @@ class Door:
 
 
 def serve(
-    build: Callable[[FastAPI], None],
+    build: Callable[[FastAPI], object],
     sock: socket.socket,
     stop: threading.Event,
     *,
@@ -89,6 +91,7 @@ def serve(
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     app.add_middleware(Door, token=token, port=sock.getsockname()[1])
     build(app)
+    ui.add_css(_FOCUS, shared=True)
     logging.getLogger("nicegui").setLevel(logging.ERROR)  # warnings of its own end are no user's business
     ui.run_with(
         app, dark=None, show_welcome_message=False, message_history_length=_KEPT_MESSAGES, binding_refresh_interval=None

@@ -14,6 +14,8 @@ from drocap_ros.skeleton import COLOURS
 WIDTH, ROW = 1000.0, 28.0
 HEIGHT = 3 * ROW
 FEET = ("left", "right")
+#: Of a foot that rests by hand, or does not.
+_RESTS, _RESTS_NOT = 'fill="#2a2" stroke="white"', 'fill="#888" stroke="#c33" stroke-width="2" stroke-dasharray="6"'
 
 
 class TimeAxis:
@@ -77,11 +79,14 @@ def bars_svg(
         y, style = ROW * row + 4, f'fill="{rgb(COLOURS[foot])}" fill-opacity="0.6"'
         out += [bar(a, b - 1, y, ROW - 8, style) for a, b in spans]
         out += [
-            bar(*axis.span(entry), y, ROW - 8, f'fill="{"#2a2" if entry["rests"] else "#c33"}" stroke="white"')
+            bar(*axis.span(entry), y, ROW - 8, _RESTS if entry["rests"] else _RESTS_NOT)
             for entry in corrections.get("feet", ())
             if entry["foot"] == foot
         ]
-        out.append(f'<text x="4" y="{ROW * (row + 0.7)}" font-size="13" fill="currentColor">{foot} foot</text>')
+    out += [
+        f'<text x="4" y="{ROW * (row + 0.7)}" font-size="13" fill="currentColor">{words}</text>'
+        for row, words in enumerate(("range", *(f"{foot} foot" for foot in FEET)))
+    ]
     x = axis.x(shown)
     out.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="{HEIGHT}" stroke="currentColor" stroke-width="2"/>')
     return "".join(out)

@@ -120,6 +120,11 @@ def _system_errors(target: Path, option: str = "--out", only: tuple[int, ...] = 
 
 
 def _replace(path: Path, target: Path) -> None:
+    """Move over what is there; of a folder its files alone, others stay."""
     if target.is_dir() and not target.is_symlink():
+        if path.is_dir():
+            for file in path.iterdir():
+                _replace(file, target / file.name)
+            return
         shutil.rmtree(target)
     path.replace(target)

@@ -43,7 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export, of a folder of several persons each, and print the changes of the motion."""
-    from drocap_ros.report.people import people_files
+    from drocap_ros.motion import people_files
 
     people = people_files(args.motion)
     if people and args.out:

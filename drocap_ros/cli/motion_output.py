@@ -38,12 +38,12 @@ def write_outputs(
     motion: Motion,
     tracks: Tracks,
     images: Callable[[Motion], MotionImages | None],
-    beside: Sequence[Motion] = (),
+    beside: Sequence[tuple[Motion, Tracks]] = (),
 ) -> None:
     """Write the output folder at once.
 
     images : gives those of the report
-    beside : the motion as further cameras see it
+    beside : the motion as further cameras see it, and what they have seen
     """
     from drocap_ros.cli.atomic_output import output_folder
     from drocap_ros.motion import save_motion
@@ -52,8 +52,9 @@ def write_outputs(
 
     with output_folder(out) as folder:
         save_motion(folder / "motion.npz", motion)
-        for number, further in enumerate(beside, start=2):
+        for number, (further, seen) in enumerate(beside, start=2):
             save_motion(folder / f"camera_{number}.npz", further)
+            save_tracks(folder / f"camera_{number}_tracks.npz", seen)
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)
         if "report.html" in names:
@@ -118,6 +119,7 @@ def reconstruct_people(
     progress: Progress,
 ) -> str:
     """Reconstruct and write everybody, or the selected people; returns lines about them."""
+    from drocap_ros.motion import people_files
     from drocap_ros.people import reconstruct_everybody
 
     people = reconstruct_everybody(
@@ -129,10 +131,12 @@ def reconstruct_people(
         telemetry=telemetry,
         selection=selection,
     )
-    motions = {}
+    motions, video = {}, selection.images or (None if people_files(source, "tracks.npz") else source)
     for number, (motion, _) in people.items():
-        motions[number] = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
-    names = _save(out, motions, {number: tracks for number, (_, tracks) in people.items()}, source, args.no_report)
+        meta = {**motion.meta, "command": args.command_line, "input": (video or source).name}
+        motions[number] = dataclasses.replace(motion, meta=meta)
+    kept = {number: tracks for number, (_, tracks) in people.items()}
+    names = _save(out, motions, kept, video, report=not args.no_report)
     lines = [_words(number, motion) for number, motion in motions.items()]
     lines += next(iter(motions.values())).meta["left_out"]
     return "\n".join([*lines, f"written: {out}/{', '.join(names)}"])
@@ -149,7 +153,7 @@ def _words(number: int, motion: Motion) -> str:
 
 
 def _save(
-    out: Path, motions: Mapping[int, Motion], tracks: Mapping[int, Tracks], source: Path, no_report: bool
+    out: Path, motions: Mapping[int, Motion], tracks: Mapping[int, Tracks], video: Path | None, *, report: bool
 ) -> list[str]:
     """Write the folder of each and the report of all; returns the names written.  Files of an older run go."""
     from drocap_ros.cli.atomic_output import output_folder
@@ -161,8 +165,8 @@ def _save(
         save_people_tracks(folder, tracks)
         for name, motion in zip(names, motions.values(), strict=True):
             save_motion(folder / name / FILE, motion)
-        if not no_report:
-            save_people_report(folder / "report.html", motions, video=source)
+        if report:
+            save_people_report(folder / "report.html", motions, video=video)
             names.append("report.html")
     for older in (out / FILE, out / "tracks.npz", out / "report.html", *out.glob("person_*/*.npz")):
         if not {older.name, older.parent.name} & set(names):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import itertools
 import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drocap_ros.cli.corrections import ONE, corrections_of, corrections_together, videos_of
 from drocap_ros.cli.motion_output import add_all_option, people_of, reconstruct_people
 from drocap_ros.cli.options import (
     Subparsers,
@@ -28,7 +30,6 @@ from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
 if TYPE_CHECKING:
     from drocap_ros.config import DrocapConfig
-    from drocap_ros.corrections import Corrections
     from drocap_ros.motion import Motion
     from drocap_ros.recording.video_telemetry import Telemetry
 
@@ -63,13 +64,13 @@ def add_parser(subparsers: Subparsers) -> None:
         " times and places against each other are found",
     )
     add_all_option(parser, "one motion each")
-    add_options(parser)
+    add_options(parser, videos="append")
     add_threads_option(parser)
     add_quiet_option(parser)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of one reconstruction; ``drocap batch`` has them too."""
+def add_options(parser: argparse.ArgumentParser, videos: str = "store") -> None:
+    """Options of one reconstruction; ``drocap batch`` has them too.  ``videos`` : what a second ``--video`` does."""
     parser.add_argument(
         "--method",
         choices=METHODS,
@@ -148,13 +149,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--video",
         metavar="FILE",
         type=Path,
-        help="with tracks as INPUT: the images that they are of; the report shows them",
+        action=videos,
+        help="with tracks as INPUT, or a folder of person_N/tracks.npz: the images that they are of, for each INPUT;"
+        " the report shows them",
     )
     parser.add_argument(
         "--corrections",
         metavar="YAML",
         type=Path,
-        help="what is corrected by hand: joints, sides, feet, who is meant, what is vertical (`drocap app` writes it)",
+        help="what is corrected by hand: joints, sides, feet, who is meant, what is vertical (`drocap app` writes it);"
+        " of several persons or recordings the folder of their motions",
     )
     add_network_options(parser)
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
@@ -180,6 +184,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     from drocap_ros.cli.report import open_words
     from drocap_ros.cli.running import progress_bars
     from drocap_ros.config import load_config
+    from drocap_ros.corrections import Corrections
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
     from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
@@ -194,7 +199,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     telemetry = _telemetry(args)
-    corrections = _corrections(args, people)
+    video, said = next(iter(videos_of(args, [args.input])), None), corrections_of(args, people)
     with (
         as_tracks_file(args.input, Stated(args.rate, args.image_size, args.order, person)) as source,
         progress_bars(args.quiet, _SHARES) as progress,
@@ -213,9 +218,10 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
             args.topic,
             rate_hz,
             args.evidence,
-            corrections,
-            args.video,
+            said.get(ONE, Corrections()),
+            video,
             people or (),
+            said,
             args.threads,
         )
         if people is not None:
@@ -223,7 +229,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
             if not args.quiet:
                 print(text)
             return 0
-        shown = args.video or (source if source == args.input and has_images(source) else None)
+        shown = video or (source if source == args.input and has_images(source) else None)
         with ImagesBeside(shown if "report.html" in names else None, progress, 4 if args.threads > 1 else 0) as images:
             selection = dataclasses.replace(selection, on_image=images.keep)
             if args.threads > 1:
@@ -237,7 +243,7 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
                 telemetry=telemetry,
                 selection=selection,
             )
-            meta = {**motion.meta, "input": (args.video or args.input).name, "command": args.command_line}
+            meta = {**motion.meta, "input": (video or args.input).name, "command": args.command_line}
             motion = dataclasses.replace(motion, meta=meta)
             write_outputs(out, names, motion, tracks, images.of)
     if not args.quiet:
@@ -245,17 +251,6 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
         if "report.html" in names:
             print(open_words(out / "report.html"))
     return 0
-
-
-def _corrections(args: argparse.Namespace, people: tuple[int, ...] | None) -> Corrections:
-    from drocap_ros.corrections import Corrections, load_corrections
-
-    if args.video and (args.input.suffix != ".npz" or not args.video.exists()):
-        found = f"found {args.input.name}" if args.video.exists() else "found no such file"
-        raise InputError(f"--video {args.video}: expected the images of tracks .npz as INPUT, {found}; correct it")
-    if args.corrections and (people is not None or args.method == "live"):
-        raise InputError(f"--corrections {args.corrections}: expected one person, offline; leave --all or live out")
-    return load_corrections(args.corrections) if args.corrections else Corrections()
 
 
 def _telemetry(args: argparse.Namespace) -> Telemetry:
@@ -332,8 +327,6 @@ _OF_ONE = {
     "focal": None,
     "calibration": None,
     "evidence": None,
-    "corrections": None,
-    "video": None,
 }
 #: Of a camera without telemetry and fixed points that moves.
 _BY_BODY = "; its camera moves as the body turns in its pictures"
@@ -348,8 +341,9 @@ def run_together(args: argparse.Namespace) -> int:
     from drocap_ros.cli.report import open_words
     from drocap_ros.cli.running import progress_bars
     from drocap_ros.config import load_config
+    from drocap_ros.motion import FILE
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.pipeline import needs_networks, reconstruct_together
+    from drocap_ros.pipeline import Selection, needs_networks, reconstruct_together
     from drocap_ros.recording.keypoints.files import Stated, as_tracks_file
     from drocap_ros.recording.video_telemetry import Telemetry
     from drocap_ros.report.motion_images import ImagesBeside, has_images
@@ -359,6 +353,8 @@ def run_together(args: argparse.Namespace) -> int:
     out = args.out or default_folder(args.input, "motion")
     names = output_names(args, out, clip_of(args))
     beside = [f"camera_{number}.npz" for number in range(2, len(inputs) + 1)]
+    videos = videos_of(args, inputs)
+    corrections = corrections_together(args, [FILE, *beside])
     config = with_known(load_config(args.config), args)
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
@@ -376,14 +372,19 @@ def run_together(args: argparse.Namespace) -> int:
             models=args.models,
             progress=progress,
             telemetry=Telemetry(args.telemetry),
-            threads=args.threads,
+            selections=[
+                Selection(corrections=said, images=video, threads=args.threads)
+                for said, video in itertools.zip_longest(corrections, videos)
+            ],
         )
         motions = [
-            dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line}) for motion, _ in found
+            dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line, "input": path.name})
+            for (motion, _), path in zip(found, videos or inputs, strict=True)
         ]
-        video = sources[0] if sources[0] == args.input and has_images(sources[0]) else None
-        images = stack.enter_context(ImagesBeside(video, progress))
-        write_outputs(out, names, motions[0], found[0][1], images.of, motions[1:])
+        shown = videos[0] if videos else sources[0] if sources[0] == args.input and has_images(sources[0]) else None
+        images = stack.enter_context(ImagesBeside(shown, progress))
+        further = [(motion, tracks) for motion, (_, tracks) in zip(motions, found, strict=True)][1:]
+        write_outputs(out, names, motions[0], found[0][1], images.of, further)
     if not args.quiet:
         print(summary(motions[0], "ba", time.perf_counter() - begin))
         print(view_words(motions[0]))

@@ -38,8 +38,8 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the report, and the video beside it."""
     from drocap_ros.cli.atomic_output import output_file
+    from drocap_ros.motion import people_files
     from drocap_ros.report.page import save_report
-    from drocap_ros.report.people import people_files
 
     if people := people_files(args.motion):
         return _report_people(args, people)

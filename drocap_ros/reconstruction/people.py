@@ -31,7 +31,8 @@ def reconstruct_people(
     path and its metres are those of all.  The others' sizes are measured in it, and their motions last from the first
     to the last image that shows them.
 
-    people : tracks of the same images by number, with the same camera and fixed points
+    people : tracks of the same images by number, with the same camera and fixed points; what one has as vertical is so
+        for all
     """
     seen = {number: np.flatnonzero(np.isfinite(tracks.keypoints).any(axis=(1, 2))) for number, tracks in people.items()}
     first = max(people, key=lambda number: (len(seen[number]), -number))
@@ -41,7 +42,10 @@ def reconstruct_people(
         "adjuster": adjuster,
         "progress": progress,
     }
-    found = solve(people[first], **settings)
+    vertical = [tracks.vertical for tracks in people.values() if tracks.vertical is not None]
+    found = solve(
+        dataclasses.replace(people[first], vertical=np.concatenate(vertical) if vertical else None), **settings
+    )
     lead, camera = found.motion, found.shared_camera
     motions: dict[int, Motion] = {}
     for number, tracks in people.items():

@@ -9,17 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.clip import Progress
-from drocap_ros.motion import FILE, Motion
+from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.report.statistics import SMOOTH_S
-
-
-def people_files(folder: Path) -> dict[int, Path]:
-    """Motion files in the folders ``person_N`` of a folder without a motion of its own, by number."""
-    if not folder.is_dir() or (folder / FILE).exists():
-        return {}
-    files = {path.parent.name.removeprefix("person_"): path for path in folder.glob(f"person_*/{FILE}")}
-    return {int(number): files[number] for number in sorted(filter(str.isdecimal, files), key=int)}
 
 
 def leader(people: Mapping[int, Motion]) -> int:

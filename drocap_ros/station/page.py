@@ -45,8 +45,9 @@ for (const kind of ["keydown", "keyup"])
   grid-template-columns: repeat(auto-fit, minmax(min(100%%, 26rem), 1fr)); }
 .station > * { min-width: 0; }
 .station > .wide { grid-column: 1 / -1; }
+.old { color: #c10015; }
+.body--dark .old { color: #ff7b7b; }
 .facts { display: grid; grid-template-columns: auto 1fr; gap: 0 0.8rem; width: 100%%; }
-*:focus-visible { outline: 3px solid #3fbdb5; outline-offset: 1px; }
 </style>"""
 
 
@@ -110,8 +111,8 @@ class Page:
             self._body = scene.point_cloud(
                 [[-99.0, -99.0, 0.0], [99.0, 99.0, 0.0]], [_BODY_COLOUR] * 2, point_size=0.06
             )
-            self._drone = scene.box(0.5, 0.5, 0.12).material("#e67e22")
-            self._nose = scene.box(0.3, 0.06, 0.06).material("#c0392b")
+            self._drone = scene.box(0.5, 0.5, 0.12).material("#e67e22").visible(False)
+            self._nose = scene.box(0.3, 0.06, 0.06).material("#c0392b").visible(False)
             scene.move_camera(x=-6, y=-7, z=4, look_at_x=0, look_at_y=0, look_at_z=1, duration=0)
 
     def _send(self, action: str) -> None:
@@ -149,13 +150,14 @@ class Page:
             for part, ahead_m in ((self._drone, 0.0), (self._nose, 0.4)):
                 part.move(*np.round(look.vehicle + ahead_m * look.turn[:, 0], 3).tolist())
                 part.rotate_R(np.round(look.turn, 4).tolist())
+                part.visible()
 
 
 def _facts_html(look: Look) -> str:
     rows = [f"<b>{name}</b><span>{html.escape(words)}</span>" for name, words in look.facts.items()]
     for name, age_s in look.ages.items():
         text = "never" if age_s == float("inf") else f"{age_s:.1f} s ago"
-        old = ' class="text-negative"' if age_s > OLD_S else ""
+        old = ' class="old"' if age_s > OLD_S else ""
         rows.append(f"<b>{name}</b><span{old}>{text}</span>")
     return f'<div class="facts">{"".join(rows)}</div>'
 

@@ -22,40 +22,32 @@ def serve(station: Station, sock: socket.socket, token: str, stop: threading.Eve
 
     def build(app: FastAPI) -> None:
         _add_routes(app, station)
+        ui.page("/", title="drocap station")(lambda: Page(station))
+
+    from nicegui import ui
 
     serving.serve(build, sock, stop, token=token, failed=lambda: station.failure is not None)
 
 
 def _add_routes(app: FastAPI, station: Station) -> None:
-    from nicegui import ui
     from starlette.responses import Response
 
-    def route(path: str, method: str, act: Callable[[Request], Response]) -> None:
+    def sign(path: str, act: Callable[[str], None]) -> None:
         async def answer(request: Request) -> Response:
-            return act(request)
-
-        app.add_route(path, answer, methods=[method])
-
-    def sign(act: Callable[[str], None]) -> Callable[[Request], Response]:
-        def answer(request: Request) -> Response:
             # The header is none that a foreign page may set.
             page = request.headers.get("X-Station-Page")
             if page is not None:
                 act(page)
             return Response(status_code=403 if page is None else 204)
 
-        return answer
+        app.add_route(path, answer, methods=["POST"])
 
-    def picture(_: Request) -> Response:
+    async def picture(_: Request) -> Response:
         data, kind = station.picture()
         headers = {"Cache-Control": "no-store"}
         return Response(data, 200 if data else 404, headers=headers, media_type=kind)
 
-    route("/alive", "POST", sign(station.alive))
-    route("/leave", "POST", sign(station.leave))
-    route("/stop", "POST", sign(lambda page: station.order(page, "stop", {})))
-    route("/picture", "GET", picture)
-
-    @ui.page("/", title="drocap station")
-    def page() -> None:
-        Page(station)
+    sign("/alive", station.alive)
+    sign("/leave", station.leave)
+    sign("/stop", lambda page: station.order(page, "stop", {}))
+    app.add_route("/picture", picture)

@@ -74,6 +74,13 @@ class Hand:
     def click(self, selector: str, at: tuple[float, float] = (0.5, 0.5)) -> None:
         self.drag(selector, at, at)
 
+    def drop(self, *files: Path) -> None:
+        """Files upon the page."""
+        wait(lambda: self.browser.run("!!document.querySelector('input[type=file]')"), "the place for files")
+        document = self.browser.send("DOM.getDocument")["root"]["nodeId"]
+        node = self.browser.send("DOM.querySelector", nodeId=document, selector="input[type=file]")["nodeId"]
+        self.browser.send("DOM.setFileInputFiles", nodeId=node, files=[str(file) for file in files])
+
     def press(self, label: str) -> None:
         """Click a button or tab by its words."""
         self.click(
@@ -120,6 +127,10 @@ def idle(hand: Hand) -> bool:
     return bool(hand.browser.run("!document.querySelector('.q-linear-progress')"))
 
 
+def corrections_of(folder: Path) -> str:
+    return (folder / "corrections.yaml").read_text()
+
+
 def solve(hand: Hand, motion: Path) -> None:
     before = motion.stat().st_mtime_ns
     hand.press("Solve again")
@@ -132,10 +143,7 @@ def folder(desk: tuple[Path, str], hand: Hand, tmp_path_factory: pytest.TempPath
     video = tmp_path_factory.mktemp("clip") / "three.avi"
     write_video(video, SCENE)
     browser = hand.browser
-    wait(lambda: browser.run("!!document.querySelector('input[type=file]')"), "the place for files")
-    document = browser.send("DOM.getDocument")["root"]["nodeId"]
-    node = browser.send("DOM.querySelector", nodeId=document, selector="input[type=file]")["nodeId"]
-    browser.send("DOM.setFileInputFiles", nodeId=node, files=[str(video)])
+    hand.drop(video)
     wait(lambda: (desk[0] / "three.avi").exists(), "the clip in the folder")
     time.sleep(1.0)
     hand.press("Find persons")
@@ -226,6 +234,93 @@ def test_another_person_is_meant_from_here_on(folder: Path, hand: Hand) -> None:
     now = load_motion(folder).keypoints[:, :15]
     np.testing.assert_array_equal(now[:10], mine[:10])
     assert np.nanmedian(np.linalg.norm(now[10:] - other[10:], axis=2)) < 6.0
+
+
+def test_up_is_set_by_two_clicks_on_something_that_leans_in_the_picture(folder: Path, hand: Hand) -> None:
+    def roll_deg() -> float:
+        up = load_motion(folder).camera_rotation[0][:, 2]
+        return float(np.degrees(np.arctan2(up[0], -up[1])))
+
+    before = roll_deg()
+    hand.press("Vertical")
+    picture, size = "document.querySelector('[data-part=picture]')", np.array([640.0, 360.0])
+    lean = np.deg2rad(before + 8.0)
+    for along in (-120.0, 120.0):  # px from the middle of the picture
+        at = size / 2 + along * np.array([np.sin(lean), -np.cos(lean)])
+        hand.click(picture, tuple(at / size))
+    solve(hand, folder / "motion.npz")
+    assert hand.clicks <= 8
+    ((lower, upper),) = [(e["bottom"], e["top"]) for e in yaml.safe_load(corrections_of(folder))["upright"]]
+    assert lower[1] > upper[1]
+    assert 3.0 < roll_deg() - before < 10.0
+
+
+def test_corrections_are_kept_by_each_action_for_every_page_and_taken_back(
+    desk: tuple[Path, str], folder: Path, hand: Hand, tmp_path: Path
+) -> None:
+    other = Hand(Browser(tmp_path / "profile"))
+    other.browser.open(desk[1], 1400, 1000)
+    other.press("Correct")
+    try:
+        hand.press("Exchange legs")
+        other.press("Exchange arms")
+        assert [e["limbs"] for e in yaml.safe_load(corrections_of(folder))["sides"]] == ["legs", "arms"]
+        assert "does not follow the corrections yet" in hand.browser.run("document.body.innerText")
+        other.press("Undo")
+        assert [e["limbs"] for e in yaml.safe_load(corrections_of(folder))["sides"]] == ["legs"]
+        (folder / "corrections.yaml").write_text("sides: [{limbs: leg}]")
+        other.press("Exchange all")
+        assert "expected one of legs, arms, all" in other.browser.run("document.body.innerText")
+        other.browser.open(desk[1], 1400, 1000)
+        other.press("Correct")
+        other.press("Delete the corrections")
+        wait(lambda: not (folder / "corrections.yaml").exists(), "no corrections")
+    finally:
+        other.browser.close()
+    hand.press("Undo")
+
+
+def test_a_page_that_is_opened_during_a_job_shows_it(
+    desk: tuple[Path, str], folder: Path, hand: Hand, tmp_path: Path
+) -> None:
+    before, gone = (folder / "motion.npz").stat().st_mtime_ns, Browser(tmp_path / "profile")
+    gone.open(desk[1], 1400, 1000)
+    first = Hand(gone)
+    first.press("Correct")
+    first.press("Solve again")
+    gone.close()
+    hand.browser.open(desk[1], 1400, 1000)
+    wait(lambda: (folder / "motion.npz").stat().st_mtime_ns != before, "another solution")
+    wait(lambda: idle(hand), "the end of its progress")
+    hand.press("Correct")
+
+
+def test_what_is_no_video_is_refused_and_a_name_that_is_taken_gets_a_number(
+    desk: tuple[Path, str], folder: Path, hand: Hand, tmp_path: Path
+) -> None:
+    (tmp_path / "leer ä b.mp4").touch()
+    (tmp_path / "three.avi").write_bytes((desk[0] / "three.avi").read_bytes())
+    hand.drop(tmp_path / "leer ä b.mp4", tmp_path / "three.avi")
+    words = "leer ä b.mp4: expected a video or a flight log, found neither"
+    wait(lambda: words in hand.browser.run("document.body.innerText"), "a refusal")
+    wait(lambda: (desk[0] / "three_2.avi").exists(), "a copy")
+    assert not (desk[0] / "leer ä b.mp4").exists()
+    (desk[0] / "three_2.avi").unlink()
+
+
+def test_the_keyboard_alone_reaches_every_control(folder: Path, hand: Hand) -> None:
+    hand.press("Exchange legs")
+    assert hand.browser.not_by_keyboard() == []
+    hand.click("document.querySelector('[data-part=timeline]')", (0.001, 0.15))  # the first image
+    hand.click("document.querySelector('[data-joint=lknee]')")
+    for key in ("ArrowRight", "[", "ArrowRight", "]", "d", "l"):
+        hand.browser.key(key)
+    said = yaml.safe_load(corrections_of(folder))
+    assert said["feet"] == [{"from": 0.08, "to": 0.16, "foot": "left", "rests": True}]
+    (entry,) = said["joints"]
+    assert entry["time"] == 0.16
+    hand.browser.key("ArrowLeft")
+    hand.browser.key("ArrowLeft")
 
 
 def test_a_motion_is_exported_and_read_back(folder: Path, hand: Hand, tmp_path: Path) -> None:

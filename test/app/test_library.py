@@ -43,7 +43,7 @@ def test_the_library_has_motions_of_one_and_of_several_and_says_what_is_damaged(
     assert sorted(found) == ["all/person_1", "all/person_2", "damaged", "one"]
     assert "expected a readable .npz archive" in found["damaged"]
     assert not clips(tmp_path)
-    entry = Entry(tmp_path / "one", "one")
+    entry = Entry(tmp_path / "one" / "motion.npz", "one")
     assert entry.thumbnail is None
     assert entry.video is None
     assert entry.quality.startswith("quality: ")
@@ -51,7 +51,7 @@ def test_the_library_has_motions_of_one_and_of_several_and_says_what_is_damaged(
 
 def test_it_is_solved_again_from_its_tracks_with_its_options_and_corrections(made: Path, tmp_path: Path) -> None:
     shutil.copytree(made / "walk_motion", tmp_path / "one")
-    entry = Entry(tmp_path / "one", "one")
+    entry = Entry(tmp_path / "one" / "motion.npz", "one")
     before = load_motion(tmp_path / "one")
     assert "--corrections" not in entry.words(None)
     said = {"sides": [{"from": 0.5, "to": 1.0, "limbs": "legs"}]}
@@ -68,6 +68,27 @@ def test_it_is_solved_again_from_its_tracks_with_its_options_and_corrections(mad
     meant = entry.corrected(said).keypoints
     assert np.array_equal(after.keypoints[:, :15], meant, equal_nan=True)
     assert not np.array_equal(meant, entry.tracks.keypoints, equal_nan=True)
+
+
+def test_persons_and_cameras_are_solved_again_together(made: Path, tmp_path: Path) -> None:
+    for name in ("all/person_1", "all/person_10", "two", ".two.abc"):
+        shutil.copytree(made / "walk_motion", tmp_path / name)
+    shutil.copy(tmp_path / "two" / "motion.npz", tmp_path / "two" / "camera_2.npz")
+    shutil.copy(tmp_path / "two" / "tracks.npz", tmp_path / "two" / "camera_2_tracks.npz")
+    found = {entry.name: entry for entry in motions(tmp_path)}
+    assert sorted(found) == ["all/person_1", "all/person_10", "two", "two/camera_2"]
+    second, person = found["two/camera_2"], found["all/person_10"]
+    assert second.corrections_file == tmp_path / "two" / "camera_2_corrections.yaml"
+    assert second.words(None)[:4] == [
+        "reconstruct", str(tmp_path / "two/tracks.npz"), str(tmp_path / "two/camera_2_tracks.npz"), "--together"
+    ]  # fmt: skip
+    assert person.words(None)[:3] == ["reconstruct", str(tmp_path / "all"), "--all"]
+    for entry in (second, person):
+        assert "--corrections" not in entry.words(None)
+        save_corrections(entry.corrections_file, {"sides": [{"limbs": "legs"}]})
+    for name in ("two", "all/person_1"):
+        words = found[name].words(None)
+        assert words[words.index("--corrections") + 1] == str(found[name].folder)
 
 
 def test_a_job_tells_its_progress_and_the_one_line_of_a_refusal(made: Path, tmp_path: Path) -> None:

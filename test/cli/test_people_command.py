@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from people_scenes import PeopleScene, camera_of, of_another, people_of, write_video
 
 from drocap_ros.cli import main
+from drocap_ros.corrections import load_corrections, save_corrections
 from drocap_ros.motion import load_motion
 from drocap_ros.tracks import load_tracks
 
@@ -31,6 +33,52 @@ def out(video: Path) -> Path:
     folder = video.parent / "out"
     assert main(["reconstruct", str(video), "--all", "--models", "simulation", "--out", str(folder), "--quiet"]) == 0
     return folder
+
+
+def test_persons_are_corrected_one_by_one_and_solved_again_together(
+    video: Path, out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base = ["reconstruct", str(out), "--all", "--video", str(video), "--quiet", "--out"]
+    assert main([*base, str(tmp_path / "again")]) == 0  # without networks
+    before, again = ({n: load_motion(f / f"person_{n}") for n in (1, 2, 3)} for f in (out, tmp_path / "again"))
+    for number, motion in before.items():
+        np.testing.assert_array_equal(again[number].joints3d, motion.joints3d)
+        assert again[number].meta["input"] == video.name
+    assert (tmp_path / "again" / "report.html").exists()
+    lead = before[1].meta["camera_found_with"]
+    other, third = (number for number in before if number != lead)
+    said = {"sides": [{"from": 0.5, "to": 1.5, "limbs": "legs"}]}
+    save_corrections(tmp_path / "again" / f"person_{other}" / "corrections.yaml", said)
+    whole = [*base, str(tmp_path / "again"), "--corrections", str(tmp_path / "again")]
+    assert main(whole) == 0
+    now = {n: load_motion(tmp_path / "again" / f"person_{n}") for n in (1, 2, 3)}
+    assert now[other].meta["corrections"] == said
+    assert np.abs(now[other].joints3d - before[other].joints3d).max() > 0.02
+    for number in (lead, third):
+        np.testing.assert_array_equal(now[number].joints3d, before[number].joints3d)
+        assert "corrections" not in now[number].meta
+    file = tmp_path / "again" / f"person_{other}" / "corrections.yaml"
+    assert load_corrections(file).values == said  # kept with its motion
+    # A line in the picture is vertical for all, whoever's page it was marked on; here it leans by 10 degrees.
+    lower, upper = [320.0, 300.0], [320.0 + 200.0 * math.tan(math.radians(10.0)), 100.0]
+    save_corrections(file, {"upright": [{"time": 0.4, "bottom": lower, "top": upper}]})
+    assert main(whole) == 0
+    tilts = []
+    for motion in (before[third], load_motion(tmp_path / "again" / f"person_{third}")):
+        up = motion.camera_rotation[0][:, 2]
+        tilts.append(float(np.degrees(np.arctan2(up[0], -up[1]))))
+    assert 3.0 < tilts[1] - tilts[0] < 12.0
+    save_corrections(file, {"person": [{}]})
+    for words, expected in (
+        (whole, f"person {other}: expected some images that show it"),
+        ([*base, str(tmp_path / "no"), "--corrections", str(file)], "expected a folder of person_N/corrections.yaml"),
+        (["reconstruct", str(out), "--out", str(tmp_path / "no")], "add --all"),
+        (["reconstruct", str(out), "--subject", "1,7", "--out", str(tmp_path / "no")], "expected one of 1, 2, 3"),
+    ):
+        assert main(words) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert expected in line, line
+    assert not (tmp_path / "no").exists()
 
 
 def test_everybody_has_a_motion_in_one_world(out: Path) -> None:

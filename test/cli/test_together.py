@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from drocap_ros.cli import main
-from drocap_ros.evaluation.metrics import pa_mpjpe
+from drocap_ros.corrections import save_corrections
+from drocap_ros.evaluation.metrics import aligned_error, pa_mpjpe
 from drocap_ros.motion import load_motion
 from drocap_ros.simulation.pinhole import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.skeleton import BODY_17
-from drocap_ros.tracks import Tracks, save_tracks
+from drocap_ros.skeleton import BODY_17, other_side
+from drocap_ros.tracks import Tracks, load_tracks, save_tracks
 from lab.simulation.orbit import orbit_camera
 from lab.studies.world_scene import PinholePath, followed_points
 
@@ -81,6 +82,47 @@ def test_two_still_cameras_give_one_body_that_is_better_than_either(
     there = np.flatnonzero(both.stamp_ns * 1e-9 >= view["offset_s"])[: len(right.stamp_ns)]
     np.testing.assert_array_equal(right.joints3d, both.joints3d[there])
     assert float(np.nanmedian(right.reprojection_px)) < 5.0
+
+
+def test_recordings_are_corrected_one_by_one_and_solved_again_together(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, legs = tmp_path / "both", [BODY_17.index(name) for name in ("lknee", "lankle", "ltoe")]
+    swapped, inputs = [BODY_17.index(other_side(BODY_17.joints[j], BODY_17.joints)) for j in legs], []
+    for name in ("left", "right"):
+        tracks = load_tracks(recordings / f"{name}.npz")
+        wrong = tracks.keypoints.copy()
+        if name == "right":  # for a second
+            wrong[40:65, legs + swapped] = wrong[40:65, swapped + legs]
+        save_tracks(tmp_path / f"{name}.npz", replace(tracks, keypoints=wrong))
+        inputs.append(str(tmp_path / f"{name}.npz"))
+    base = ["--together", "--out", str(out), "--no-report", "--quiet"]
+    assert main(["reconstruct", *inputs, *base]) == 0
+    before = load_motion(out)
+    kept = [str(out / "tracks.npz"), str(out / "camera_2_tracks.npz")]
+    assert main(["reconstruct", *kept, *base]) == 0  # from what it has kept
+    np.testing.assert_array_equal(load_motion(out).joints3d, before.joints3d)
+    said = {"sides": [{"from": 40 / FPS, "to": 64 / FPS, "limbs": "legs"}]}
+    save_corrections(out / "camera_2_corrections.yaml", said)
+    assert main(["reconstruct", *kept, *base, "--corrections", str(out)]) == 0
+    after, second = load_motion(out), load_motion(out / "camera_2.npz")
+    assert second.meta["corrections"] == said
+    assert "corrections" not in after.meta
+    joints = truth(np.arange(FRAMES) / FPS)
+    begin = 40 + round(LATER_S * FPS)
+    knees = np.s_[begin : begin + 25, [BODY_17.index("lknee"), BODY_17.index("rknee")]]
+    errors = [aligned_error(motion.joints3d[:, :17], joints)[knees].mean() for motion in (before, after)]
+    assert errors[1] < 0.7 * errors[0]
+    # A file alone is the first recording's; a folder without one is refused, and so is a video of one of them.
+    save_corrections(tmp_path / "first.yaml", said)
+    assert main(["reconstruct", *kept, *base, "--corrections", str(tmp_path / "first.yaml")]) == 0
+    assert load_motion(out).meta["corrections"] == said
+    for words, expected in (
+        (["--corrections", str(recordings)], "expected corrections.yaml beside its motions"),
+        (["--video", str(recordings / "left.npz")], "expected one for each INPUT, 2, found 1"),
+    ):
+        assert main(["reconstruct", *kept, *base, *words]) == 2
+        assert expected in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("background", [True, False])

@@ -110,6 +110,22 @@ class Browser:
             self.send("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **extra)
         self.settle()
 
+    def not_by_keyboard(self) -> list[str]:
+        """Controls that the Tab key does not reach, or that do not show that they have the focus."""
+        found = self.run(
+            "[...document.querySelectorAll('button, input, a[href], select, textarea, [tabindex=\"0\"]')].filter(e =>"
+            " e.checkVisibility() && !e.disabled && e.type !== 'file' && e.role !== 'tab').map((e, i) => {"
+            " e.dataset.control = i; return e.ariaLabel || e.innerText || e.className; })"
+        )
+        self.run("document.activeElement.blur()")
+        reached = set()
+        for _ in range(2 * len(found) + 20):
+            for kind in ("keyDown", "keyUp"):
+                self.send("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab", windowsVirtualKeyCode=9)
+            shown = "getComputedStyle(e.closest('.q-field') || e).boxShadow !== 'none' && e.dataset.control"
+            reached.add(self.run(f"(e => {shown})(document.activeElement)"))
+        return [words for number, words in enumerate(found) if str(number) not in reached]
+
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         """One mouse event at a place in the window."""
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)

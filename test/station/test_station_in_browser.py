@@ -149,6 +149,7 @@ def test_an_orbit_is_started_adjusted_and_stopped_by_the_keyboard_alone(served):
     page.type("speed", "10")
     page.press("adjust")
     served.wait(lambda: served.got[-1].command == Command.ADJUST and served.got[-1].command_accepted, 10, "adjusted")
+    assert page.not_by_keyboard() == []
     # Space on a button that has the focus is no press of it.
     page.press("start", "Space")
     served.wait(lambda: served.got[-1].command == Command.STOP and served.got[-1].command_accepted, 10, "a stop")
