@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import PARTLY, overlap_coefficient
+from drocap_ros.perception.detection.nms import overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import certainly_others
 from drocap_ros.perception.tracking.person import DOUBT_S, SURE_CONFIDENCE, Person, person_at
@@ -36,7 +36,7 @@ class SubjectChoice:
         if self.box is None:
             return None
         box, self.box = self.box, None
-        return person_at(box, persons, stamp_ns, PARTLY) or Person(box, 0.0, stamp_ns, describe(image, box))
+        return person_at(box, persons, stamp_ns) or Person(box, 0.0, stamp_ns, describe(image, box))
 
     def by_rule(
         self,

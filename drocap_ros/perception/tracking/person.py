@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import iou
+from drocap_ros.perception.detection.nms import PARTLY, TOUCHES, areas_of, iou, overlap_coefficient
 from drocap_ros.perception.tracking.camera_motion import moved_box
 from drocap_ros.perception.tracking.own_joints import LEAST_JOINTS, SLOW_RATE, ExpectedJoints
 
@@ -147,6 +147,7 @@ _LIMBS_PER_S = 0.15  # and more per second (root of the variance): persons turn 
 _ESTABLISHED = 1.0
 _NOBODY = 2.0  # sum of what its poses lack, from which a track that was never established is nobody
 _SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
+_INSIDE = 0.8  # share of a detection in a drawn box from which it is inside
 _LONG_AGO_NS = 10**18
 #: First, least and largest recent share of detections of a person, and the weight of a new image in it.
 _FIRST_RATE_SEEN, _RATES, _SEEN_RATE = 0.5, (0.2, 0.9), 0.2
@@ -199,7 +200,7 @@ class PoseBelief:
         self._support = max(self._support + confidence - CONFIRM_CONFIDENCE, 0.0)
         self._established |= self._support >= _ESTABLISHED
         if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self.usual):
-            self._believe(box, stamp_ns)
+            self.choose(box, stamp_ns, known=False)
             self.usual = confidence if not self.usual else self.usual + SLOW_RATE * (confidence - self.usual)
             if limbs is not None:
                 self._poses += 1
@@ -222,13 +223,10 @@ class PoseBelief:
         variance = _LIMBS**2 * (1 + 1 / self._poses) + _LIMBS_PER_S**2 * (stamp_ns - self.believed_ns) * 1e-9
         return float(np.exp(-0.5 * np.nanmean(off) / variance))
 
-    def choose(self, box: np.ndarray, stamp_ns: int) -> None:
-        """Believe a box (4,) px that a user or a drone's tracker gave, whatever its pose."""
-        self._believe(box, stamp_ns)
-        self._established = True
-
-    def _believe(self, box: np.ndarray, stamp_ns: int) -> None:
+    def choose(self, box: np.ndarray, stamp_ns: int, *, known: bool = True) -> None:
+        """Believe a box (4,) px, whatever its pose where a user or a drone's tracker gave it (``known``)."""
         self.believed_ns, self.box, self._failing_ns = stamp_ns, np.array(box, float), None
+        self._established |= known
         if self.plausible_ns is None:
             self.plausible_ns, self.began = stamp_ns, self.box
         length = float((self.box[2:] - self.box[:2]).max())
@@ -438,11 +436,14 @@ def _blend(mean: np.ndarray | None, appearance: np.ndarray, rate: float) -> np.n
     return appearance if mean is None else np.asarray(np.sqrt((1 - rate) * mean**2 + rate * appearance**2))
 
 
-def person_at(box: np.ndarray, persons: Iterable[Person], stamp_ns: int, least: float) -> Person | None:
-    """Who was detected in this image where a box (4,) px is, with at least this overlap (IoU)."""
+def person_at(box: np.ndarray, persons: Iterable[Person], stamp_ns: int) -> Person | None:
+    """Who was detected in this image where a box (4,) px is, or inside one that somebody has drawn loosely."""
     detected = [p for p in persons if p.detected_ns == stamp_ns]
-    overlap = iou(box[None].astype(float), boxes_of(detected))[0]
-    return detected[int(overlap.argmax())] if overlap.max(initial=0.0) >= least else None
+    boxes = boxes_of(detected)
+    overlap, shared = iou(box[None].astype(float), boxes)[0], overlap_coefficient(box[None].astype(float), boxes)[0]
+    inside = (shared > _INSIDE) & (areas_of(boxes) < areas_of(box[None])) & (overlap > TOUCHES)
+    overlap[(overlap < PARTLY) & ~inside] = 0.0
+    return detected[int(overlap.argmax())] if overlap.max(initial=0.0) > 0 else None
 
 
 def boxes_of(persons: Iterable[Person]) -> np.ndarray:

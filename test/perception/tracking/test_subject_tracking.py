@@ -378,3 +378,24 @@ def test_windows_lie_in_the_image_and_tiles_cover_it():
     assert tiles((960, 540)) == []
     cut = uncut(np.array([[100.0, 100, 200, 200], [300, 110, 400, 220]]), (100, 0, 500, 400), size)
     assert cut.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.0, 1.6, 2.4])
+@pytest.mark.parametrize("seed", range(4))
+def test_box_that_is_drawn_loosely_names_the_person_in_it(scale, seed):
+    rng = np.random.default_rng(seed)
+    persons = [(200, 180, 120, RED), (430, 180, 120, BLUE)]
+    centre = np.array([430, 180]) + rng.uniform(-1, 1, 2) * np.array([24, 60]) * max(scale - 1.0, 0.1)
+    half = scale * rng.uniform(0.9, 1.1, 2) * np.array([24, 60])
+    scene = Scene(subject="box", subject_box=",".join(f"{v:.1f}" for v in (*(centre - half), *(centre + half))))
+    first = scene.show(persons)
+    assert first.score > 0  # the detection, not the box that was drawn
+    assert offset(first, 430) < 5
+
+
+@pytest.mark.parametrize("x", [380, 400, 412])
+def test_box_of_somebody_who_is_not_detected_names_nobody_beside(x):
+    scene = Scene(subject="box", subject_box=f"{x - 24},120,{x + 24},240")
+    first = scene.show([(x, 180, 120, RED), (x + 36, 180, 120, BLUE)], unseen=(0,))
+    assert first.score == 0
+    assert offset(first, x) < 5
