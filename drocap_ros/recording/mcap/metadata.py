@@ -39,6 +39,18 @@ def own_definitions() -> dict[str, str]:
     return {f"{PACKAGE}/msg/{path.stem}": path.read_text(encoding="utf-8") for path in sorted(folders[0].glob("*.msg"))}
 
 
+#: Definitions of images in other packages, which recordings before ROS 2 Iron do not hold.
+_OTHERS = {
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\n"
+    "uint64 pts\nuint8 flags\nbool is_bigendian\nuint8[] data\n",
+    **{
+        f"foxglove_msgs/msg/Compressed{kind}": "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\n"
+        "string format\n"
+        for kind in ("Image", "Video")
+    },
+}
+
+
 @lru_cache(maxsize=1)
 def standard_types() -> Typestore:
     """Message types of the ROS distribution and this package's."""
@@ -46,7 +58,7 @@ def standard_types() -> Typestore:
 
     store = get_typestore(Stores[f"ROS2_{ROS_DISTRIBUTION.upper()}"])
     types = {}
-    for name, text in own_definitions().items():
+    for name, text in {**own_definitions(), **_OTHERS}.items():
         types.update(get_types_from_msg(text, name))
     store.register(types)
     return store
