@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.sources.image_files import colour_rank, decoded, raw_to_bgr
+from drocap_ros.perception.sources.image_files import NO_PICTURE, colour_rank, decoded, raw_to_bgr
 from drocap_ros.perception.sources.video import codec_of, decoded_packets
 from drocap_ros.recording.session import IMAGES, Message, Session, TopicInfo, header_stamp_ns
 from drocap_ros.stamps import CONFIRMED_AFTER, NS
@@ -20,8 +19,6 @@ from drocap_ros.stamps import CONFIRMED_AFTER, NS
 if TYPE_CHECKING:
     from drocap_ros.perception.sources.base import Frame
 
-#: A topic of this name holds no pictures of a camera.
-_NO_PICTURE = re.compile(r"depth|disparity|mask|label|segment|confidence", re.IGNORECASE)
 #: Rank of a topic of distances or labels, behind colour (0) and grey (1).
 _DEPTH_RANK = 2
 #: Least step of stamps against the recorder's times that is one of the clock, and no jitter.
@@ -71,7 +68,7 @@ def _rank(session: Session, topic: TopicInfo) -> tuple[int, float]:
     """0 for colour, 1 for grey, 2 for distances and labels, and the area, by the first message; infinity of a video."""
     first = next((message for _, message in session.messages((topic.name,))), None)
     form = str(getattr(first, "encoding", getattr(first, "format", "")))
-    rank = _DEPTH_RANK if first is None or _NO_PICTURE.search(topic.name) else colour_rank(form)
+    rank = _DEPTH_RANK if first is None or NO_PICTURE.search(topic.name) else colour_rank(form)
     try:
         return rank, float(np.prod(image_from_message(first).shape[:2]))
     except (InputError, AttributeError, ValueError):  # a packet of a video, or damage

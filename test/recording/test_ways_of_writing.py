@@ -219,12 +219,12 @@ def test_foxglove_s_calibration_is_the_lens(tmp_path, encoding, packing, indexed
                 time = {"timestamp": {"sec": sec, "nsec": nsec}}
                 content = base64.b64encode(jpeg(i).tobytes()).decode()
                 both = [{**time, "format": "jpeg", "data": content},
-                        {**time, "width": 64, "height": 48, "distortion_model": "plumb_bob", "K": MATRIX.tolist()}]  # fmt: skip
+                        {**time, "width": 64, "height": 48, "distortion_model": "", "K": MATRIX.tolist()}]  # fmt: skip
                 data = [json.dumps(message).encode() for message in both]
             else:
                 time = varint(1, sec) + varint(2, nsec)
                 data = [fields([(1, time), (2, jpeg(i).tobytes()), (3, b"jpeg")]),
-                        fields([(1, time), (2, 64), (3, 48), (4, b"plumb_bob"), (5, np.zeros(5)), (6, MATRIX)])]  # fmt: skip
+                        fields([(1, time), (2, 64), (3, 48), (5, np.zeros(5)), (6, MATRIX)])]  # fmt: skip
             for channel, message in zip((image, lens), data, strict=True):
                 writer.add_message(channel, stamp, message, stamp)
         writer.finish()

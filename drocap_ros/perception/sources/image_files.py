@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import re
 from itertools import pairwise
@@ -160,8 +161,12 @@ def _layout(encoding: str) -> tuple[int, str | None, np.dtype]:
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 
-#: Least number of digits of a file name that is a time in nanoseconds (the EuRoC and TUM convention).
-_STAMP_DIGITS = 16
+#: A time at the end of a name: seconds with their fraction (TUM), or ms, us or ns as one number (EuRoC, Kalibr).
+_TIME = re.compile(r"(?:^|\D)(?:(\d{9,10})(?:\.(\d{3,9})|_(\d{9}))|(\d{13,19}))$")
+#: A name's begin, number and end.
+_NUMBERED = re.compile(r"(.*?)(\d*)(\D*)")
+#: Names of what is no picture of a camera.
+NO_PICTURE = re.compile(r"depth|disparity|mask|label|segment|confidence", re.IGNORECASE)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -201,20 +206,27 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 class ImageFileSource(ImageSource):
     """Image files of one size.
 
-    Stamps are the file names where these are times in nanoseconds, else ``rate_hz`` counts from 0.  Files of a folder
-    that do not decode are gaps, and a ``DAMAGED`` event follows at the end.
+    Stamps are the times in the files' names, else ``rate_hz`` and their numbers count from 0.  Files of a folder that
+    do not decode are gaps, and a ``DAMAGED`` event follows at the end.
     """
 
     def __init__(self, path: Path, rate_hz: float = 30.0) -> None:
         super().__init__()
         if path.is_dir():
-            self._paths = sorted(
-                (p for p in path.glob("[!.]*") if p.suffix.lower() in SUFFIXES and p.is_file()),
-                key=lambda p: _natural(p.name),
-            )
+            there = sorted(path.glob("[!.]*"), key=lambda p: _natural(p.name))
+            self._paths = _of_one_recording([p for p in there if p.suffix.lower() in SUFFIXES and p.is_file()])
             if not self._paths:
-                raise InputError(f"{path}: expected a folder with images ({', '.join(sorted(SUFFIXES))}), found none")
+                found = ", ".join(dict.fromkeys(p.suffix or f"{p.name}/" for p in there)) or "none"
+                raise InputError(
+                    f"{path}: expected a folder with images ({', '.join(sorted(SUFFIXES))}), found {found}; name one of"
+                    " its videos or folders, or convert its files"
+                )
         else:
+            if _pictures_in(path) > 1:
+                raise InputError(
+                    f"{path}: expected one picture, found {_pictures_in(path)} in one file; convert it: ffmpeg -i IN"
+                    " OUT.mp4, or the pages to files of a folder"
+                )
             self._paths = [path]
         self._stamps = _stamps(self._paths, rate_hz)
         self._next, self._damaged = 0, list[Path]()
@@ -265,9 +277,46 @@ class ImageFileSource(ImageSource):
 
 
 def _stamps(paths: list[Path], rate_hz: float) -> list[int]:
-    stems = [p.stem for p in paths]
-    if all(s.isdigit() and len(s) >= _STAMP_DIGITS for s in stems):
-        stamps = [int(s) for s in stems]
-        if all(b > a for a, b in pairwise(stamps)):
-            return stamps
+    """Times of the images, ns: those in their names, else their numbers, in even steps, by the rate."""
+    found = [match.groups() for p in paths if (match := _TIME.search(p.stem))]
+    times = [int(whole) if whole else int(s + (fraction or ns).ljust(9, "0")) for s, fraction, ns, whole in found]
+    if len(times) == len(paths) > 1 and all(b > a for a, b in pairwise(times)):
+        step = float(np.median(np.diff(times)))
+        for unit_ns in (1, 10**3, 10**6):
+            if 1e6 <= step * unit_ns <= 1e10:  # of a camera
+                return [time * unit_ns for time in times]
+    numbers = [int(number) for p in paths if (number := _NUMBERED.fullmatch(p.stem.lower())[2])]  # type: ignore[index]
+    steps = [b - a for a, b in pairwise(numbers)]
+    # Of frames' numbers most follow each other.
+    if len(numbers) == len(paths) > 1 and min(steps) > 0 and 2 * steps.count(least := math.gcd(*steps)) > len(steps):
+        return [round((number - numbers[0]) // least * 1e9 / rate_hz) for number in numbers]
     return [round(i * 1e9 / rate_hz) for i in range(len(paths))]
+
+
+def _of_one_recording(paths: list[Path]) -> list[Path]:
+    """The pictures of the recording with most of them, where names differ otherwise than by their last number.
+
+    Such are two cameras, masks or depths beside the pictures, or each picture in two formats.
+    """
+    kinds: dict[tuple[str, str], list[Path]] = {}
+    for path in paths:
+        begin, _, end = _NUMBERED.fullmatch(path.name.lower()).groups()  # type: ignore[union-attr]
+        # Six digits before the last number are a date or a time.
+        kinds.setdefault(("" if sum(map(str.isdigit, begin)) >= 6 else begin, end), []).append(path)
+    if len(kinds) < 2 or len(kinds) > len(paths) / 4:  # else names have nothing in common
+        return paths
+    best = min(kinds, key=lambda kind: (bool(NO_PICTURE.search("".join(kind))), -len(kinds[kind])))
+    there = ", ".join(f"{begin}*{end} ({len(of)})" for (begin, end), of in kinds.items())
+    words = f"{'*'.join(best)} is used; put another into a folder of its own"
+    logger.warning("%s: several recordings, %s: %s", paths[0].parent, there, words)
+    return kinds[best]
+
+
+def _pictures_in(path: Path) -> int:
+    """Number of pages or of pictures of an animation in one file."""
+    import cv2
+
+    try:
+        return int(cv2.imcount(str(path), cv2.IMREAD_UNCHANGED))
+    except cv2.error:
+        return 0

@@ -169,7 +169,7 @@ class VideoSource(ImageSource):
         except self._error as error:
             raise InputError(
                 f"{path}: expected a video that FFmpeg can open, found {path.stat().st_size} bytes without a readable"
-                f" header or index ({first_line(error)}); copy it again"
+                f" header or index ({error.strerror or first_line(error)}); copy it again"
             ) from None
         self._closed = False
         self._last_ns: int | None = None
@@ -180,11 +180,12 @@ class VideoSource(ImageSource):
     def _begin(self) -> None:
         """Choose the track, read what the container states, and the first picture."""
         known = [stream for stream in self._container.streams.video if stream.codec_context is not None]
-        known = [s for s in known if not s.disposition & s.disposition.attached_pic] or known
-        if not known and self._container.streams.audio and not self._container.streams.video:
+        shown = [s for s in known if not s.disposition & s.disposition.attached_pic]
+        only_covers = not shown and len(known) == len(self._container.streams.video)
+        if only_covers and self._container.streams.audio:
             self.close()
             raise InputError(f"{self.path}: expected a video, found sound without pictures; name the video")
-        if not known:
+        if not (known := shown or known):
             raise self._refused(f"no video of a known codec ({', '.join(track_codes(self.path)) or 'no track'})")
         self._stream = self._chosen(known)
         self._stream.thread_type = "AUTO"
@@ -289,7 +290,8 @@ class VideoSource(ImageSource):
             decoded = f"{end_s:.1f} of {self._stated_s or end_s:.1f} s decoded"
         short = not self._stream.frames or (self.length is not None and self._count < self.length - _TAIL_FRAMES)
         tail_s = _TAIL_FRAMES * end_s / max(self._count - 1, 1)
-        if short and self._stated_s and end_s + tail_s < self._stated_s - _TAIL_FRAMES / self._rate_hz:
+        begin_s = max(self._origin_ns or 0, 0) * 1e-9  # in Matroska the duration is a time: that of the end
+        if short and self._stated_s and begin_s + end_s + tail_s < self._stated_s - _TAIL_FRAMES / self._rate_hz:
             self._tell(SourceEventKind.ENDED_EARLY, f"cut off or damaged, {decoded}")
         elif damaged := self._decoder.damaged:
             near = next((f" near {time_s:.1f} s" for time_s in damaged if time_s is not None), "")

@@ -41,14 +41,15 @@ def own_definitions() -> dict[str, str]:
 
 #: Definitions of images in other packages, which recordings before ROS 2 Iron do not hold.
 _OTHERS = {
-    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\n"
-    "uint64 pts\nuint8 flags\nbool is_bigendian\nuint8[] data\n",
-    **{
-        f"foxglove_msgs/msg/Compressed{kind}": "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\n"
-        "string format\n"
-        for kind in ("Image", "Video")
-    },
-}
+    name: text.replace("; ", "\n")
+    for text, *names in (
+        ("std_msgs/Header header; int32 width; int32 height; string encoding; uint64 pts; uint8 flags;"
+         " bool is_bigendian; uint8[] data", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"),
+        ("builtin_interfaces/Time timestamp; string frame_id; uint8[] data; string format",
+         "foxglove_msgs/msg/CompressedImage", "foxglove_msgs/msg/CompressedVideo"),
+    )
+    for name in names
+}  # fmt: skip
 
 
 @lru_cache(maxsize=1)
