@@ -8,7 +8,7 @@ import csv
 import itertools
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -26,9 +26,8 @@ from drocap_ros.recording.telemetry.log import (
     make_log,
     plausible,
 )
+from drocap_ros.recording.text import rows_of
 
-#: Characters of a line, beyond which the file is no table: Airdata's lines have about a thousand.
-_LINE = 16384
 #: Rows: five hours at Airdata's ten a second.
 _MAX_ROWS = 200_000
 _GIMBAL, _AIRCRAFT = ("gimbal pitch", "gimbal roll", "gimbal yaw"), ("pitch", "roll", "yaw")
@@ -90,7 +89,7 @@ class _Table:
     """Rows of a file at times that increase; a column that is not there is NaN."""
 
     def __init__(self, path: Path) -> None:
-        cells = _cells(path)
+        cells = rows_of(path)
         head = [name.strip().lower() for name in next(cells, [])]
         found: dict[str, tuple[int, float]] = {}
         for i, title in enumerate(head):
@@ -119,18 +118,6 @@ class _Table:
         return rows[:, [self._names.index(name) if self.has(name) else -1 for name in names]]
 
 
-def _cells(path: Path) -> Iterator[list[str]]:
-    """Rows as text; where the comma is for decimals a spreadsheet writes semicolons or tabs, and may name them."""
-    with path.open("rb") as file:
-        wide = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
-    with path.open("r", encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as text:
-        first = text.readline(_LINE)
-        if first.lower().startswith("sep="):
-            first = text.readline(_LINE)
-        lines = itertools.chain([first], iter(lambda: text.readline(_LINE), ""))
-        yield from csv.reader(lines, delimiter=max(",;\t", key=first.count))
-
-
 def _column(title: str) -> tuple[str, float] | None:
     """Our name of a column and its unit in ours, None where it is another column or unit."""
     match = _TITLE.fullmatch(title)
@@ -156,8 +143,6 @@ def _number(text: str) -> float:
     text = text.strip().lower()
     if time := _FLY_TIME.fullmatch(text):
         return 3600.0 * float(time[1] or 0) + 60.0 * float(time[2] or 0) + float(time[3])
-    if text.count(",") == 1 and "." not in text:
-        text = text.replace(",", ".")
     try:
         value = float({"true": "1", "false": "0"}.get(text, text))
     except ValueError:

@@ -30,6 +30,7 @@ from drocap_ros.recording.telemetry.log import (
     make_log,
 )
 from drocap_ros.recording.telemetry.video_tracks import find_track, read_samples
+from drocap_ros.recording.text import open_text
 from drocap_ros.tracks import MAX_FRAMES
 
 #: Formats of a video's subtitle tracks: of MP4 (3GPP TS 26.245, QuickTime), whose texts begin with their length, and by
@@ -49,9 +50,9 @@ _CLOCK = re.compile(r"\d\s+(\d{1,2}):(\d\d):(\d\d[.,]\d{3})")
 _GPS = re.compile(
     rf"\b(?:GPS|RTK)\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I
 )
-_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
+_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*[:(]\s*{_NUMBER}|[,\s]H\s*=?\s*{_NUMBER}\s*m")
 #: Place of take-off, and the distance from it, m.
-_DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*{_NUMBER}\s*m")
+_DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*=?\s*{_NUMBER}\s*m")
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
 _VIEWS_DEG = (5.0, 170.0)  # possible fields of view
 #: Horizontal field of view, deg.
@@ -68,7 +69,7 @@ class _Entry(NamedTuple):
     kind : of the height, "" = none
     clock_s : time of day
     home : place of take-off in the order of the text, and the distance from it, m
-    plain : whether nothing beside the numbers says which of them is the latitude
+    plain : 1 where nothing beside the numbers says which of them is the latitude, 2 beside a height
     """
 
     stamp_ns: int
@@ -79,7 +80,7 @@ class _Entry(NamedTuple):
     lens: tuple[float, float, float]
     clock_s: float
     home: tuple[float, float, float]
-    plain: bool
+    plain: float
 
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
@@ -90,7 +91,7 @@ def read_srt(path: Path) -> TelemetryLog:
     entries = _entries(path)
     stamps, places, kinds, gimbal, body, lens, clock_s, home, plain = map(np.array, zip(*entries, strict=True))
     if _latitude_first(places, home, plain):
-        places[plain, :2] = places[plain, 1::-1]
+        places[plain > 0, :2] = places[plain > 0, 1::-1]
     heights = next((kind for kind in _HEIGHTS if kind in kinds), "height")
     position = from_first_fix(_geodetic(places), above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
@@ -123,18 +124,21 @@ def _entries(path: Path) -> list[_Entry]:
 def _latitude_first(places: np.ndarray, home: np.ndarray, plain: np.ndarray) -> bool:
     """Whether plain pairs, taken as longitude and latitude, are the other way round.
 
-    A latitude is below 90 degrees, and the distance from take-off fits one order.
+    A latitude is below 90 degrees, the distance from take-off fits one order, and before a height it comes first.
     """
-    latitude, longitude = places[plain, :2].T
+    latitude, longitude = places[plain > 0, :2].T
     if (np.abs(latitude) > 90).any():
         return bool((np.abs(longitude) <= 90).all())
-    east, north = longitude - home[plain, 0], latitude - home[plain, 1]
+    if (np.abs(longitude) > 90).any():
+        return False
+    (at_east, at_north, way), by_height = home[plain > 0].T, bool((plain > 1).any())
+    east, north = longitude - at_east, latitude - at_north
     off = [
-        np.abs(METRES_PER_DEG * np.hypot(dx * np.cos(np.deg2rad(at)), dy) - home[plain, 2])
+        np.abs(METRES_PER_DEG * np.hypot(dx * np.cos(np.deg2rad(at)), dy) - way)
         for dx, dy, at in ((east, north, latitude), (north, east, longitude))
     ]
     as_is, turned = (float(np.nansum(errors)) for errors in off)
-    return turned < 0.5 * as_is
+    return turned < 0.5 * as_is or (by_height and not as_is < 0.5 * turned)
 
 
 def _geodetic(places: np.ndarray) -> np.ndarray:
@@ -158,8 +162,9 @@ def _inside(path: Path) -> Iterator[tuple[int, str]]:
 def _subtitles(path: Path) -> Iterator[tuple[int, str]]:
     """Time ns in the video and text of each subtitle."""
     stamp_ns, text = None, ""
-    with path.open("r", encoding="utf-8", errors="replace") as file:
+    with open_text(path) as file:
         while line := file.readline(_LINE):
+            line = re.sub(r"(:\s*-?\d+),(?=\d)", r"\1.", line)  # a decimal comma
             match = _TIME.search(line)
             if match is None:
                 text = (text + line)[:_LINE]
@@ -190,7 +195,7 @@ def _entry(stamp_ns: int, text: str) -> _Entry | None:
     gimbal, body = (angles.get(of, _UNKNOWN) for of in "GF")
     way = _DISTANCE.search(text)
     home = (float(way[1]), float(way[2]), float(way[3])) if way else _UNKNOWN
-    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text), home, "plain" in values)
+    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text), home, values.get("plain", 0.0))
 
 
 def _values(text: str) -> dict[str, float]:
@@ -206,7 +211,7 @@ def _values(text: str) -> dict[str, float]:
         if gps[6] or "." in gps[5]:  # else the number of satellites
             values["altitude"] = float(gps[5])
         if not gps[1] and not gps[6]:
-            values["plain"] = 1.0
+            values["plain"] = 2.0 if "." in gps[5] else 1.0
     if barometer := _BAROMETER.search(text):
         values["barometer"] = float(barometer[1] or barometer[2])
     return values
