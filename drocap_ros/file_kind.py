@@ -67,7 +67,7 @@ def file_kind(path: Path) -> FileKind:
 
 
 #: A stream's or web page's address, whose slashes a path has lost.
-_ADDRESS = re.compile(r"([a-z]+):/+(?=[^/])", re.IGNORECASE)
+_ADDRESS = re.compile(r"([a-z][a-z\d+]+):/+(?=[^/])", re.IGNORECASE)
 
 
 def missing(path: Path, expected: str) -> InputError:
@@ -88,6 +88,8 @@ _UNPACK = {
 def unpacking(path: Path) -> str:
     """What to do with a file that is none of the kinds that are read, after a sentence about it."""
     command = _UNPACK.get(path.suffix.lower())
+    if path.suffix.lower() in (".npz", ".npy"):
+        return f"; `drocap info {path}` says what is in it"
     return f"; unpack it: {command} {path}" if command else "; check the file, or record it again"
 
 

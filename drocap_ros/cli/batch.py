@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drocap_ros.cli.options import LineParser, Subparsers, add_command, add_quiet_option
+from drocap_ros.cli.options import LineParser, Subparsers, add_command, add_quiet_option, clip_of
 from drocap_ros.cli.reconstruct import add_options
 from drocap_ros.errors import InputError
 
@@ -109,12 +109,17 @@ def _read_tasks(args: argparse.Namespace) -> list[Task]:
 
 
 def _check_files(defaults: argparse.Namespace) -> None:
-    """Refuse a missing file of an option before the work."""
+    """Refuse options that no recording can have, and a missing file of one, before the work."""
+    from drocap_ros.cli.reconstruct import attitude_of, with_known
+    from drocap_ros.config import load_config
     from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
     for name, value in vars(defaults).items():
         if isinstance(value, Path) and name != "models" and value != NO_TELEMETRY and not value.exists():
             raise InputError(f"--{name} {value}: no such file; check the path")
+    clip_of(defaults)
+    attitude_of(defaults)
+    with_known(load_config(defaults.config), defaults)
 
 
 def _resolved(arguments: argparse.Namespace) -> argparse.Namespace:
