@@ -237,7 +237,7 @@ def _read_c3d(path: Path) -> _Points:
 
 def _read_trc(path: Path) -> _Points:
     """Tab-separated: the labels stand in the row that begins with ``Frame#``; an empty cell is unknown."""
-    text = re.sub(r"(?<=\d),(?=\d)", ".", path.read_text(encoding="utf-8-sig", errors="replace"))
+    text = _with_points(path)
     rows = [re.split("\t" if "\t" in text else r" +", line) for line in text.splitlines()]
     place = next((i for i, row in enumerate(rows[:20]) if row[0].strip().lower().rstrip("#") == "frame"), None)
     if place is None or place < 2:
@@ -258,6 +258,11 @@ def _read_trc(path: Path) -> _Points:
     return _Points(names, table[:, 2:].reshape(len(table), -1, 3), time_s, unit if unit in _UNITS else "mm", "Y")
 
 
+def _with_points(path: Path) -> str:
+    """A text whose decimal commas are points."""
+    return re.sub(r"(?<=\d),(?=\d)", ".", path.read_text(encoding="utf-8-sig", errors="replace"))
+
+
 def _number(text: str) -> float:
     try:
         return float(text)
@@ -276,7 +281,7 @@ class _Bone(NamedTuple):
 
 def _read_bvh(path: Path) -> _Points:
     """Forward kinematics of every joint; the format has no unit, centimetres are usual."""
-    words = iter(path.read_text(encoding="utf-8-sig", errors="replace").split())
+    words = iter(_with_points(path).split())
     try:
         bones = _hierarchy(words)
         text = list(words)  # Frames: N Frame Time: S, then the values

@@ -80,7 +80,8 @@ def _rows(session: Session, topic: TopicInfo, read: Callable[[Message], _Row]) -
 
 def _attitude(message: Message) -> _Row:
     turn = message.orientation if hasattr(message, "orientation") else message.quaternion
-    return np.full(3, np.nan), xyzw_of(turn), False
+    unknown = np.ravel(getattr(message, "orientation_covariance", 0.0))[0] == -1  # as sensor_msgs/Imu says
+    return np.full(3, np.nan), np.full(4, np.nan) if unknown else xyzw_of(turn), False
 
 
 def _pose(message: Message) -> _Row:

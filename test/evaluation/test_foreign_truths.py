@@ -106,3 +106,22 @@ def test_mocap_that_stands_along_another_axis_is_told_and_not_turned(tmp_path, c
     truth, _, _ = load_truth(tmp_path / "x.npz")
     assert "along Y" in caplog.text
     assert np.abs(1000 * truth[:, :15] - turned).max() < 1e-6
+
+
+@pytest.mark.parametrize("point", [".", ","])
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_a_bvh_is_read_in_every_spelling(tmp_path, point, newline, mark):
+    names = [name for name in BODY_17.joints if name != "pelvis"]
+    lines = ["HIERARCHY", "ROOT pelvis", "{", "OFFSET 0 0 0", "CHANNELS 3 Xposition Yposition Zposition"]
+    for name in names:
+        lines += [f"JOINT {name}", "{", "OFFSET 0.5 0 0", "CHANNELS 3 Xposition Yposition Zposition", "End Site", "{",
+                  "OFFSET 0 1 0", "}", "}"]  # fmt: skip
+    lines += ["}", "MOTION", f"Frames: {len(WORLD)}", f"Frame Time: {1 / 24:.7f}"]
+    cm = 100 * WORLD[..., [0, 2, 1]] * (1, 1, -1)
+    for root, *joints in cm[:, [0, *range(1, 17)]]:
+        lines.append(" ".join(f"{v:.5f}" for v in (*root, *(np.array(joints) - root).ravel())))
+    (tmp_path / "x.bvh").write_bytes((mark + newline.join(lines).replace(".", point)).encode())
+    truth, time_s, _ = load_truth(tmp_path / "x.bvh")
+    assert np.abs(truth - WORLD)[:, LIMBS].max() < 1e-4
+    assert np.diff(time_s) == pytest.approx(1 / 24, rel=1e-5)

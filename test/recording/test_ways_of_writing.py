@@ -17,6 +17,7 @@ from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.recording.image_messages import read_images
 from drocap_ros.recording.open_session import open_session
+from drocap_ros.recording.other_poses import read_other_poses
 from drocap_ros.recording.pose_messages import lens_of
 from drocap_ros.recording.session_tracks import with_recorded_camera
 from drocap_ros.tracks import Tracks
@@ -240,6 +241,22 @@ def test_other_names_of_a_distortion_are_known(messages, name, count, known):
     lens, words = lens_of(messages(NAMES["info"], distortion_model=name, **values))
     assert bool(words) == (known is None)
     assert not lens.distortion.any() if known is None else lens.distortion_model == known
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_an_attitude_that_an_imu_says_it_lacks_is_none(tmp_path, messages, stated):
+    covariance = np.zeros(9) if stated else np.array([-1.0, *np.zeros(8)])
+    written = []
+    for i in range(COUNT):
+        stamp = START_NS + i * STEP_NS
+        values = {"orientation": messages.quaternion((0, 0, 0, 1)), "orientation_covariance": covariance}
+        message = messages("sensor_msgs/msg/Imu", header=messages.header(stamp), **values)
+        written.append(("/imu/data", message, stamp, messages.cdr(message)))
+    record(tmp_path / "s", written)
+    with open_session(tmp_path / "s") as session:
+        found = read_other_poses(session)
+    assert np.isfinite(found.orientation).all() == stated
+    assert np.isnan(found.orientation).all() != stated
 
 
 @pytest.mark.parametrize(("small", "large", "wanted"), [(12, 12, 64), (12, 8, 64), (12, 3, 32), (3, 12, 64)])

@@ -82,6 +82,9 @@ class Decoder:
         self._aspect = aspect if aspect and 1 / Fraction(_MAX_ASPECT) <= aspect <= _MAX_ASPECT else Fraction(1)
         self._scaler = self._av.video.reformatter.VideoReformatter()
         self._size: tuple[int, int] | None = None
+        self._shape = Fraction(1)
+        #: Whether a later image is of another shape, and stretched.
+        self.reshaped = False
         self._progressive: Graph | None = None
         self._turn: int | None = None  # degrees, of the matrix by which images are shown
         self._matrix: Any = None
@@ -127,6 +130,8 @@ class Decoder:
         if self._size is None:
             across = max(self._aspect, Fraction(1))
             self._size = round(frame.width * across), round(frame.height * across / self._aspect)
+            self._shape = Fraction(frame.width, frame.height)
+        self.reshaped |= abs(Fraction(frame.width, frame.height) / self._shape - 1) > 0.02  # no rounding
         # The way of OpenCV and of the program ffmpeg.
         bgr = self._scaler.reformat(frame, *self._size, "bgr24", interpolation="BICUBIC").to_ndarray()
         pts = frame.dts if frame.pts is None else frame.pts
@@ -285,6 +290,8 @@ class VideoSource(ImageSource):
         if self._closed or self._last_ns is None:
             return
         end_s, before = self._last_ns * 1e-9, len(self._events)
+        if self._decoder.reshaped:
+            log.warning("%s: the shape of the images changes: later ones are stretched; cut it there", self.path)
         decoded = f"{self._count} of {self.length} frames decoded"
         if not self._stream.frames:
             decoded = f"{end_s:.1f} of {self._stated_s or end_s:.1f} s decoded"

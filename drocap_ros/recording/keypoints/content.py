@@ -48,6 +48,7 @@ LARGEST_PX = 1e5
 class Content:
     """What a file holds; of a person its frame, its number or None, and points (P, 4): x, y px, score, third number.
 
+    category : of COCO's kinds of things that of persons, and all kinds with joints; None where there are none
     tool : begin of the names of the orders that the file's form has
     space : whether it holds poses in space
     """
@@ -59,6 +60,7 @@ class Content:
     rate_hz: float | None = None
     pictures: dict[Label, str] = field(default_factory=dict)
     times: dict[Label, tuple[str, float]] = field(default_factory=dict)
+    category: tuple[object, set[object]] | None = None
     tool: str = ""
     space: bool = False
 
@@ -85,6 +87,14 @@ class Content:
         for key, value in node.items():
             if not self.names and _NAMES.fullmatch(key.lower()):
                 self.names = _listed_names(value)
+        if isinstance(kinds := node.get("categories"), list):
+            joints = {
+                str(kind.get("id")): _listed_names(kind.get("keypoints")) for kind in kinds if isinstance(kind, dict)
+            }
+            limbs = {number: len(limbs_of(names_of(names))) for number, names in joints.items() if names}
+            if limbs:
+                best = max(limbs, key=lambda number: limbs[number])
+                self.category, self.names = (best, set(limbs)), joints[best]
         if isinstance(pictures := node.get("images"), list):  # of COCO: numbers of pictures need not be in their order
             pairs = [
                 (p["id"], p["file_name"]) for p in pictures if isinstance(p, dict) and {"id", "file_name"} <= p.keys()
@@ -114,6 +124,8 @@ def walk(node: object, frame: Label, content: Content, who: Label = None) -> Non
 
 def _walk_object(node: Node, frame: Label, content: Content, who: Label) -> None:
     content.note(node)
+    if content.category and str(node.get("category_id")) in content.category[1] - {content.category[0]}:
+        return  # an animal
     frame = next((name for key in _FRAME if isinstance(name := node.get(key), int | float | str)), frame)
     for key in _TIMES & node.keys():
         with contextlib.suppress(TypeError, ValueError):
@@ -140,7 +152,8 @@ def _points_of(node: Node, content: Content) -> np.ndarray | None:
     scores = next(_lists(node, _SCORES), None)
     for value in _lists(node, _POINTS):
         points = _points(value, scores)
-        if points is None or not content.names:  # a list of names without points is COCO's categories
+        # A list of names without points is COCO's category.
+        if content.category is None and (points is None or not content.names):
             content.names = _names_in(value) or content.names
         if points is not None:
             return points

@@ -154,3 +154,21 @@ def test_a_recording_that_begins_late_is_whole(tmp_path, caplog, start_s, contai
     assert stamps[0] == 0
     assert max(np.diff(stamps)) < 10**9
     assert not caplog.text
+
+
+@pytest.mark.parametrize(("size", "told"), [((48, 64), True), ((64, 48), False), ((48, 36), False), ((64, 36), True)])
+def test_images_of_another_shape_on_the_way_are_told(tmp_path, caplog, size, told):
+    """As a browser's recording of a phone that is turned, or of a link that gets slower."""
+    av = pytest.importorskip("av")
+    for name, (width, height) in (("a.ts", (64, 48)), ("b.ts", size)):
+        with av.open(str(tmp_path / name), "w", format="mpegts") as file:
+            stream = file.add_stream("libx264", rate=30)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            for value in [*range(90, 110), None]:
+                frame = None if value is None else av.VideoFrame.from_ndarray(picture(value, (height, width)), "bgr24")
+                for packet in stream.encode(frame):
+                    file.mux(packet)
+    (tmp_path / "c.ts").write_bytes((tmp_path / "a.ts").read_bytes() + (tmp_path / "b.ts").read_bytes())
+    with open_source(tmp_path / "c.ts") as source:
+        assert {frame.image.shape for frame in source} == {(48, 64, 3)}
+    assert ("shape of the images changes" in caplog.text) == told

@@ -250,3 +250,25 @@ def test_ids_of_many_persons_stay(tmp_path):
     path = write(tmp_path / "k.json", nodes)
     found = [read_keypoints(path, Stated(15.0, SIZE, None, n)) for n in range(1, 6)]
     assert all(any(is_walk(each, person) for each in found) for person in people)
+
+
+ANIMAL = ["L_Eye", "R_Eye", "Nose", "Neck", "Root_of_tail"]
+ANIMAL += [f"{side}_{joint}" for side in "LR" for joint in ("Shoulder", "Elbow", "F_Paw", "Hip", "Knee", "B_Paw")]
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(["person", "dog", "car"])))
+@pytest.mark.parametrize("first", [True, False])
+def test_a_person_is_told_from_an_animal_by_the_category(tmp_path, order, first):
+    k, dog = crossing(20)
+    joints = {"person": list(JOINTS), "dog": ANIMAL, "car": []}
+    number = {name: i + 1 for i, name in enumerate(order)}
+    people = [
+        {"id": number[name], "image_id": i, "category_id": number[name], "keypoints": flat(p)}
+        for i in range(len(k))
+        for name, p in (("dog", dog[i]), ("person", k[i]))
+    ]
+    kinds = {"categories": [{"id": number[name], "name": name, "keypoints": joints[name]} for name in order]}
+    of_images = [{"id": i, "width": 1280, "height": 720, "file_name": f"{i:05d}.jpg"} for i in range(len(k))]
+    rest = {"images": of_images, "annotations": people}
+    path = write(tmp_path / "coco.json", {**kinds, **rest} if first else {**rest, **kinds})
+    assert is_walk(read_keypoints(path), k)
