@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
 import re
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,6 +17,8 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
 
 logger = logging.getLogger(__name__)
+
+Image = TypeVar("Image")
 
 # The header of a small file can declare an image of gigabytes.  OpenCV reads this limit when it is imported.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
@@ -198,9 +202,9 @@ def encode_jpeg(image: np.ndarray, quality: int = 90) -> bytes:
     return data.tobytes()
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
+def natural(name: object) -> list[tuple[int, int, str]]:
     """Sort key that puts frame_2 before frame_10."""
-    return [(1, int(t), "") if t.isdigit() else (0, 0, t) for t in re.split(r"(\d+)", name) if t]
+    return [(1, int(t), "") if t.isdigit() else (0, 0, t) for t in re.split(r"(\d+)", str(name)) if t]
 
 
 class ImageFileSource(ImageSource):
@@ -213,8 +217,11 @@ class ImageFileSource(ImageSource):
     def __init__(self, path: Path, rate_hz: float = 30.0) -> None:
         super().__init__()
         if path.is_dir():
-            there = sorted(path.glob("[!.]*"), key=lambda p: _natural(p.name))
-            self._paths = _of_one_recording([p for p in there if p.suffix.lower() in SUFFIXES and p.is_file()])
+            there = sorted(path.glob("[!.]*"), key=lambda p: natural(p.name))
+            images = [p for p in there if p.suffix.lower() in SUFFIXES and p.is_file()]
+            self._paths, words = of_one_recording(images, [p.name for p in images])
+            if words:
+                logger.warning("%s: %s", path, words)
             if not self._paths:
                 found = ", ".join(dict.fromkeys(p.suffix or f"{p.name}/" for p in there)) or "none"
                 raise InputError(
@@ -293,30 +300,27 @@ def _stamps(paths: list[Path], rate_hz: float) -> list[int]:
     return [round(i * 1e9 / rate_hz) for i in range(len(paths))]
 
 
-def _of_one_recording(paths: list[Path]) -> list[Path]:
-    """The pictures of the recording with most of them, where names differ otherwise than by their last number.
+def of_one_recording(images: list[Image], names: list[str]) -> tuple[list[Image], str]:
+    """The images of the recording with most of them, and words on others, where names differ not by a number alone.
 
     Such are two cameras, masks or depths beside the pictures, or each picture in two formats.
     """
-    kinds: dict[tuple[str, str], list[Path]] = {}
-    for path in paths:
-        begin, _, end = _NUMBERED.fullmatch(path.name.lower()).groups()  # type: ignore[union-attr]
+    kinds: dict[tuple[str, str], list[Image]] = {}
+    for image, name in zip(images, names, strict=True):
+        begin, _, end = _NUMBERED.fullmatch(name.lower()).groups()  # type: ignore[union-attr]
         # Six digits before the last number are a date or a time.
-        kinds.setdefault(("" if sum(map(str.isdigit, begin)) >= 6 else begin, end), []).append(path)
-    if len(kinds) < 2 or len(kinds) > len(paths) / 4:  # else names have nothing in common
-        return paths
+        kinds.setdefault(("" if sum(map(str.isdigit, begin)) >= 6 else begin, end), []).append(image)
+    if len(kinds) < 2 or len(kinds) > len(images) / 4:  # else names have nothing in common
+        return images, ""
     best = min(kinds, key=lambda kind: (bool(NO_PICTURE.search("".join(kind))), -len(kinds[kind])))
     there = ", ".join(f"{begin}*{end} ({len(of)})" for (begin, end), of in kinds.items())
-    words = f"{'*'.join(best)} is used; put another into a folder of its own"
-    logger.warning("%s: several recordings, %s: %s", paths[0].parent, there, words)
-    return kinds[best]
+    return kinds[best], f"several recordings, {there}: {'*'.join(best)} is used, another where it is alone"
 
 
 def _pictures_in(path: Path) -> int:
-    """Number of pages or of pictures of an animation in one file."""
+    """Number of pages or of pictures of an animation in one file; 0 of one that OpenCV does not read."""
     import cv2
 
-    try:
+    with contextlib.suppress(cv2.error):
         return int(cv2.imcount(str(path), cv2.IMREAD_UNCHANGED))
-    except cv2.error:
-        return 0
+    return 0

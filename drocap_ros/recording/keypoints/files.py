@@ -18,13 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.perception.sources.image_files import SUFFIXES
+from drocap_ros.perception.sources.image_files import SUFFIXES, natural, of_one_recording
 from drocap_ros.recording.keypoints.content import LARGEST_PX, Content, read_arrays, walk
 from drocap_ros.recording.keypoints.frames import (
     Label,
-    natural,
     numbers_of,
-    of_one_recording,
     one_person,
     seconds_of,
 )
@@ -211,7 +209,8 @@ def _series(path: Path, content: Content, subject: int | None) -> tuple[np.ndarr
 def _by_time(path: Path, content: Content, count: int) -> tuple[np.ndarray, list[tuple[int, Label, np.ndarray]]]:
     """Numbers (F,) of the frames, gaps filled up, and the persons of ``count`` points by these numbers."""
     labels = {frame: content.pictures.get(frame, frame) for frame in content.frames}
-    kept, words = of_one_recording(list(labels.values()))
+    names = list(dict.fromkeys(labels.values()))
+    kept, words = of_one_recording(names, list(map(str, names)))
     if words:
         logger.warning("%s: %s", path, words)
     numbers = numbers_of(sorted(kept, key=natural) if content.pictures else kept)

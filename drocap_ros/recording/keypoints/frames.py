@@ -48,27 +48,6 @@ def one_person(
     return chosen, words
 
 
-def of_one_recording(labels: list[Label]) -> tuple[list[Label], str]:
-    """Frames of the recording with most of them, and words on others, where the names of frames begin differently."""
-    names = list(dict.fromkeys(labels))
-    found: dict[str, list[Label]] = {}
-    for name in names:
-        found.setdefault(re.sub(r"\d+\D*$", "", name) if isinstance(name, str) else "", []).append(name)
-    # Six digits before the last number are a date or a time.
-    times = any(sum(map(str.isdigit, Path(begin).name)) >= 6 for begin in found)
-    # Recordings have at least four frames on average.
-    if len(found) < 2 or len(found) > len(names) / 4 or times:  # else the names hold other numbers
-        return labels, ""
-    best = max(found, key=lambda begin: len(found[begin]))
-    there = ", ".join(f"{begin}* ({len(of)} frames)" for begin, of in found.items())
-    return found[best], f"several recordings, {there}: {best}* is used; put one into a file for the others"
-
-
-def natural(label: Label) -> list[tuple[int, str]]:
-    """Sort key that puts frame_2 before frame_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(label)) if part]
-
-
 def numbers_of(labels: list[Label]) -> dict[Label, int]:
     """Number of each frame: the last one in its name where that tells frames apart, else its place."""
     names = list(dict.fromkeys(labels))

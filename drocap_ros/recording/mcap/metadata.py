@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import sys
 from dataclasses import dataclass
 from functools import lru_cache
@@ -231,18 +230,15 @@ def custom_metadata(description: Yaml) -> dict[str, str]:
 
 def storage_files(folder: Path, description: Yaml) -> list[Path]:
     """Files of a folder in their order, with MCAP files that a crash left out of the description."""
-    there = sorted(folder.glob("[!.]*.mcap"), key=_by_number)
+    from drocap_ros.perception.sources.image_files import natural
+
+    there = sorted(folder.glob("[!.]*.mcap"), key=lambda file: natural(file.name))
     named = description.get("relative_file_paths")
     files = [folder / Path(str(name)).name for name in named] if isinstance(named, list) else []
     if not all(file.is_file() for file in files):
         return there
     others = any(file.suffix != ".mcap" for file in files)
     return files if others else files + [p for p in there if p not in files]
-
-
-def _by_number(path: Path) -> tuple[int | str, ...]:
-    """``s_10`` comes after ``s_9``."""
-    return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name))
 
 
 def write_atomically(path: Path, text: str) -> None:
