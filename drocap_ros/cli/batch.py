@@ -213,6 +213,8 @@ _RECORDINGS = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".wmv", ".mjpeg",
 )  # fmt: skip
 _LIST = ".txt"
+#: Folders in which systems keep small pictures and remains.
+_OF_SYSTEMS = re.compile(r"@eaDir|__MACOSX|\$RECYCLE\.BIN|System Volume Information|lost\+found", re.IGNORECASE)
 
 
 def read_inputs(words: Iterable[str], defaults: argparse.Namespace) -> list[argparse.Namespace]:
@@ -273,7 +275,7 @@ def _in_folder(folder: Path) -> list[Path]:
     if (folder / METADATA_FILE).is_file():
         return [folder]
     entries = sorted(folder.glob("[!.]*"))
-    folders = [path for path in entries if path.is_dir() and not path.is_symlink()]
+    folders = [p for p in entries if p.is_dir() and not p.is_symlink() and not _OF_SYSTEMS.fullmatch(p.name)]
     inside = list(itertools.chain.from_iterable(map(_in_folder, folders)))
     if (folder / "motion.npz").exists():  # the files are a result
         return inside

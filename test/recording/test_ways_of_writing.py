@@ -259,6 +259,22 @@ def test_an_attitude_that_an_imu_says_it_lacks_is_none(tmp_path, messages, state
     assert np.isnan(found.orientation).all() != stated
 
 
+@pytest.mark.parametrize("stamp", [lambda i: 0, lambda i: START_NS, lambda i: START_NS + i * STEP_NS])
+def test_poses_whose_stamps_stand_still_have_the_recorder_s_times(tmp_path, messages, stamp):
+    written = []
+    for i in range(COUNT):
+        pose = messages("geometry_msgs/msg/Pose", position=messages("geometry_msgs/msg/Point", x=float(i)),
+                        orientation=messages.quaternion((0, 0, 0, 1)))  # fmt: skip
+        message = messages("geometry_msgs/msg/PoseStamped", header=messages.header(stamp(i)), pose=pose)
+        written.append(("/drone/pose", message, START_NS + i * STEP_NS, messages.cdr(message)))
+    record(tmp_path / "s", written)
+    with open_session(tmp_path / "s") as session:
+        found = read_other_poses(session)
+        assert found.stamp_ns.tolist() == [START_NS + i * STEP_NS for i in range(COUNT)]
+        assert found.position[:, 0].tolist() == list(range(COUNT))
+        assert any("do not advance" in words for words in session.warnings) == (stamp(0) == stamp(1))
+
+
 @pytest.mark.parametrize(("small", "large", "wanted"), [(12, 12, 64), (12, 8, 64), (12, 3, 32), (3, 12, 64)])
 @pytest.mark.parametrize("damaged", [False, True])
 def test_a_preview_is_not_taken_for_the_picture(tmp_path, messages, small, large, wanted, damaged):

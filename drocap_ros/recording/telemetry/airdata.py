@@ -4,6 +4,7 @@ DJI flight record as its readers export it; also as a spreadsheet saves it, with
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import itertools
 import math
@@ -17,12 +18,12 @@ import numpy as np
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.recording.telemetry.log import (
-    Lens,
     LogFormat,
     Series,
     TelemetryLog,
     dji_attitude,
     from_first_fix,
+    lens_of_views,
     make_log,
     plausible,
 )
@@ -67,6 +68,8 @@ def read_airdata(path: Path) -> TelemetryLog:
     geodetic = table.columns("latitude", "longitude", "height")
     found, lacks = plausible(path, Series(stamp_ns, gimbal, table.columns(*_AIRCRAFT), geodetic))
     utc_s = table.columns("utc")[:, 0] - stamp_ns * 1e-9
+    lens, zoom = lens_of_views(table.columns("view")[:, 0], "as the log states")
+    lacks += zoom
     video = true_runs(table.columns("video")[:, 0] == 1)
     body, camera = dji_attitude(found.aircraft), dji_attitude(found.gimbal)
     place = from_first_fix(found.geodetic, above_takeoff=True)
@@ -75,14 +78,8 @@ def read_airdata(path: Path) -> TelemetryLog:
         # The column has whole seconds.
         utc_minus_stamp_ns=round((float(np.nanmedian(utc_s)) + 0.5) * 1e9) if np.isfinite(utc_s).any() else None,
         video_parts=tuple((int(stamp_ns[a]), int(stamp_ns[b - 1])) for a, b in video),
-        lens=_lens(table.columns("view")[:, 0]),
+        lens=lens,
     )
-
-
-def _lens(view_deg: np.ndarray) -> Lens:
-    """The lens of a column of fields of view (N,) deg, the usual one where there is none."""
-    stated = view_deg[(view_deg >= 5) & (view_deg <= 170)]
-    return Lens.of_view(float(np.median(stated)), "as the log states") if len(stated) else Lens()
 
 
 class _Table:
@@ -151,10 +148,12 @@ def _number(text: str) -> float:
 
 
 def _utc_s(text: str) -> float:
-    try:
-        return datetime.strptime(text.strip(), "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc).timestamp()
-    except (ValueError, OverflowError):
-        return math.nan
+    """Time of a date, whose year a spreadsheet may have put last, behind the day."""
+    year_first = re.sub(r"^(\d\d?)\.(\d\d?)\.(\d{4})", r"\3-\2-\1", text.strip()).replace("/", "-").replace("T", " ")
+    for form in ("%Y-%m-%d %H:%M:%S", "%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%d %H:%M"):
+        with contextlib.suppress(ValueError, OverflowError):
+            return datetime.strptime(year_first.removesuffix("Z"), form).replace(tzinfo=timezone.utc).timestamp()
+    return math.nan
 
 
 FORMAT = LogFormat(".csv", read_airdata)

@@ -27,6 +27,7 @@ from drocap_ros.recording.telemetry.log import (
     TelemetryLog,
     dji_attitude,
     from_first_fix,
+    lens_of_views,
     make_log,
 )
 from drocap_ros.recording.telemetry.video_tracks import find_track, read_samples
@@ -54,7 +55,6 @@ _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*[:(]\s*{_NUMBER}|[,\s]H\s*=?\s*{
 #: Place of take-off, and the distance from it, m.
 _DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*=?\s*{_NUMBER}\s*m")
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
-_VIEWS_DEG = (5.0, 170.0)  # possible fields of view
 #: Horizontal field of view, deg.
 _VIEW = re.compile(rf"\b(?:fov_?h|h_?fov|horizontal_?fov|fov_?horizontal)\s*[:=]\s*{_NUMBER}", re.IGNORECASE)
 #: Pitch, roll and yaw; the degree sign may be in any encoding.
@@ -101,11 +101,8 @@ def read_srt(path: Path) -> TelemetryLog:
     real_s, shown_s = clock_s[-1] - clock_s[0], float(stamps[-1] - stamps[0]) * 1e-9
     if 1 < real_s < shown_s / 1.5:  # a second or more, and no rounding of the dates
         lacks.append(LogLack(Lack.SLOW, f"{shown_s / real_s:.1f}"))
-    steady = _lens(lens)
-    if steady is None:
-        seen = lens[:, 2] if np.isfinite(lens[:, 2]).any() else np.nanprod(lens[:, :2], axis=1)
-        unit = "deg" if np.isfinite(lens[:, 2]).any() else "mm"
-        lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(seen):.0f} {unit}" for f in (np.nanmin, np.nanmax))))
+    steady, zoom = _lens(lens)
+    lacks += zoom
     attitudes = {"orientation": dji_attitude(body), "gimbal": dji_attitude(gimbal)}
     log = make_log(path, "DJI subtitles", stamps, lacks, position=position, **attitudes)
     return log._replace(video_clock=True, lens=steady)
@@ -236,19 +233,16 @@ def _focal(text: str) -> tuple[float, float, float]:
     return float(focal) * (1.0 if "." in focal else 0.1), float(zoom) * factor, float(view[1]) if view else math.nan
 
 
-def _lens(values: np.ndarray) -> Lens | None:
-    """The lens of all subtitles (N, 3); the usual one where they state none; None where it changes."""
-    view = values[(values[:, 2] >= _VIEWS_DEG[0]) & (values[:, 2] <= _VIEWS_DEG[1]), 2]
+def _lens(values: np.ndarray) -> tuple[Lens | None, list[LogLack]]:
+    """The lens of all subtitles (N, 3), the usual one where they state none; None and why where it changes."""
     stated = values[(values[:, 0] >= 5) & (values[:, 0] <= 1000) & (values[:, 1] >= 1) & (values[:, 1] <= 100), :2]
-    for each in (view[:, None], stated):
-        if len(each) and (np.ptp(each, axis=0) > 0.01 * np.median(each, axis=0)).any():
-            return None
-    if len(view):
-        return Lens.of_view(float(np.median(view)), "as the subtitles state")
-    if not len(stated):
-        return Lens()
+    if len(stated) and (np.ptp(stated, axis=0) > 0.01 * np.median(stated, axis=0)).any():
+        seen = stated.prod(axis=1)
+        return None, [LogLack(Lack.ZOOM, f"{seen.min():.0f} mm to {seen.max():.0f} mm")]
+    if np.isfinite(values[:, 2]).any() or not len(stated):
+        return lens_of_views(values[:, 2], "as the subtitles state")
     focal, zoom = np.median(stated, axis=0)
-    return Lens(float(focal), f"{focal:g} mm equivalent of the subtitles, full sensor width assumed", float(zoom))
+    return Lens(float(focal), f"{focal:g} mm equivalent of the subtitles, full sensor width assumed", float(zoom)), []
 
 
 FORMAT = LogFormat(".srt", read_srt)

@@ -171,3 +171,15 @@ def test_a_mavic_2_has_places_without_heights(tmp_path):
     (tmp_path / "air.srt").write_text(srt_text(np.arange(60.0), ["[iso : 100] [fnum : 280]"] * 60))
     with pytest.raises(InputError, match="as the Mavic Air, write none"):
         read_telemetry(tmp_path / "air.srt")
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("damage", ["<trkpt lat=", "\x00\x01&", "</gpx>", "]]>"])
+def test_points_behind_damage_of_a_gpx_are_read(tmp_path, share, damage):
+    text = gpx([PLACE[:10], PLACE])
+    at = text.index("<trkpt", int(share * len(text)))
+    (tmp_path / "x.gpx").write_text(text[:at] + damage + text[at + 60 :])
+    log = read_telemetry(tmp_path / "x.gpx#2")
+    assert 56 <= len(log.track.stamp_ns) <= 60
+    assert is_the_orbit(log.track)
+    assert any(lack.kind is Lack.DAMAGED for lack in log.lacks)
