@@ -19,7 +19,17 @@ Value = TypeVar("Value")
 #: An object of JSON.
 Node = Mapping[str, object]
 #: Keys of a person's points, their scores, a frame, a person, all persons of one frame, the rate.
-_POINTS = ("keypoints", "pose_keypoints_2d", "keypoints_2d", "landmarks", "pose_landmarks", "joints", "points")
+_POINTS = (
+    "keypoints",
+    "pose_keypoints_2d",
+    "keypoints_2d",
+    "landmarks",
+    "pose_landmarks",
+    "joints",
+    "points",
+    "shapes",
+    "result",
+)
 _SCORES = ("keypoint_scores", "scores", "score", "confidence", "confidences", "visibility", "likelihood")
 _FRAME = ("frame_id", "image_id", "frame_index", "frame", "image_name", "file_name", "imgname")
 _WHO = ("track_id", "idx", "person_id", "instance_id")
@@ -27,7 +37,7 @@ _TOGETHER = ("people", "bodies", "instances", "persons", "predictions")
 _RATE = ("fps", "framerate", "ratehz", "videofps", "samplingrate", "samplerate")
 #: Keys, in small letters, of the size of the images: each side, both, or rows before columns as arrays have them.
 _WIDTH, _HEIGHT, _SIZE, _SHAPE = (
-    tuple(f"{of}{word}" for word in words for of in ("image", "img", "video", "frame", "ori", "orig", ""))
+    tuple(f"{of}{word}" for word in words for of in ("image", "img", "video", "frame", "ori", "orig", "original", ""))
     for words in (("width", "w"), ("height", "h"), ("size", "resolution"), ("shape",))
 )
 #: Keys of a frame's time.
@@ -49,6 +59,7 @@ class Content:
     """What a file holds; of a person its frame, its number or None, and points (P, 4): x, y px, score, third number.
 
     category : of COCO's kinds of things that of persons, and all kinds with joints; None where there are none
+    by_name : whether points came by the names of their joints, of which later persons may have more
     tool : begin of the names of the orders that the file's form has
     space : whether it holds poses in space
     """
@@ -61,6 +72,7 @@ class Content:
     pictures: dict[Label, str] = field(default_factory=dict)
     times: dict[Label, tuple[str, float]] = field(default_factory=dict)
     category: tuple[object, set[object]] | None = None
+    by_name: bool = False
     tool: str = ""
     space: bool = False
 
@@ -151,6 +163,12 @@ def _points_of(node: Node, content: Content) -> np.ndarray | None:
         content.tool = "openpose"
     scores = next(_lists(node, _SCORES), None)
     for value in _lists(node, _POINTS):
+        entries = [_flat(p) for p in value if isinstance(p, dict)]
+        placed = [p for p in entries if isinstance(p.get("name"), str) and {"x", "y"} <= p.keys()]
+        named = {str(p["name"]): p for p in placed}
+        if len(placed) == len(named) >= _LEAST and (not content.names or not named.keys().isdisjoint(content.names)):
+            content.note({key: side for key, side in placed[0].items() if key.startswith("original")})
+            return _of_names(named, content)
         points = _points(value, scores)
         # A list of names without points is COCO's category.
         if content.category is None and (points is None or not content.names):
@@ -166,10 +184,27 @@ def _named_points(node: Node, content: Content) -> np.ndarray | None:
     pairs = {key: p for key, p in node.items() if isinstance(p, list) and 2 <= len(p) <= 3}
     if len(named) < _LEAST and len(limbs_of(names_of(list(pairs)))) >= 4:
         named = {key: dict(zip(("x", "y", "score"), p, strict=False)) for key, p in pairs.items()}
-    if len(named) < _LEAST:
-        return None
-    content.names = content.names or list(named)
+    return None if len(named) < _LEAST else _of_names(named, content)
+
+
+def _of_names(named: Mapping[str, Node], content: Content) -> np.ndarray | None:
+    """Points by their names in the order of the names so far; each frame may lack some, and have more."""
+    content.names = [*content.names, *(name for name in named if name not in content.names)]
+    content.by_name = True
     return _points([named.get(name, {}) for name in content.names], None)
+
+
+def _flat(point: Node) -> Node:
+    """A point's name, place and score beside each other; PoseNet, labelme and Label Studio (per cent) nest them."""
+    inner = [value for key in ("position", "value") if isinstance(value := point.get(key), dict)]
+    found: dict[str, object] = {**point, **{key: value for part in inner for key, value in part.items()}}
+    name, place = _first_of(found, ("name", "part", "label", "keypointlabels")), found.get("points")
+    if isinstance(place, list) and len(place) == 1 and isinstance(place[0], list) and len(place[0]) == 2:
+        found["x"], found["y"] = place[0]
+    for axis, side in (("x", "original_width"), ("y", "original_height")):
+        if isinstance(full := found.get(side), int) and isinstance(share := found.get(axis), int | float):
+            found[axis] = share * full / 100
+    return {**found, "name": name[0] if isinstance(name, list) and name else name}
 
 
 def _lists(node: Node, keys: tuple[str, ...]) -> Iterator[list[object]]:

@@ -193,6 +193,10 @@ def _pixels(xy: np.ndarray, size: tuple[int, int] | None, spatial: bool) -> np.n
 
 def _series(path: Path, content: Content, subject: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (F,) of the frames, and the person's points (F, P, 4), NaN where unseen."""
+    if content.by_name:
+        more = [((0, len(content.names) - len(points)), (0, 0)) for _, _, points in content.people]
+        content.people = [(f, who, np.pad(points, pad, constant_values=np.nan) if pad[0][1] > 0 else points)
+                          for (f, who, points), pad in zip(content.people, more, strict=True)]  # fmt: skip
     counted = Counter(len(points) for _, _, points in content.people)
     if not counted:
         found = "3D poses; take the 2D keypoints of the pictures" if content.space else "none; check the file"
@@ -211,6 +215,8 @@ def _by_time(path: Path, content: Content, count: int) -> tuple[np.ndarray, list
     labels = {frame: content.pictures.get(frame, frame) for frame in content.frames}
     names = list(dict.fromkeys(labels.values()))
     kept, words = of_one_recording(names, list(map(str, names)))
+    if not any(labels[frame] in kept for frame, _, _ in content.people):  # its names say nothing of the persons
+        kept, words = names, ""
     if words:
         logger.warning("%s: %s", path, words)
     numbers = numbers_of(sorted(kept, key=natural) if content.pictures else kept)

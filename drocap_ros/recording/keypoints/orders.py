@@ -51,6 +51,10 @@ ORDERS: dict[str, tuple[str, ...]] = {
     "openpose25": _order(
         f"nose neck R:{_ARM} L:{_ARM} hip R:{_LEG} L:{_LEG} {_FACE} L:big_toe,small_toe,heel R:big_toe,small_toe,heel"
     ),
+    "openpose25b": _order(
+        "nose LR:eye,ear,shoulder,elbow,wrist,hip,knee,ankle neck head_top L:big_toe,small_toe,heel"
+        " R:big_toe,small_toe,heel"
+    ),
     "openpose19": _order(f"nose neck R:{_ARM} L:{_ARM} hip R:{_LEG} L:{_LEG} {_FACE}"),
     "openpose18": _order(f"nose neck {_LIMBS} {_FACE}"),
     "openpose15": _order(f"head_top neck {_LIMBS} chest"),

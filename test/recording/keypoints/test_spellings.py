@@ -272,3 +272,63 @@ def test_a_person_is_told_from_an_animal_by_the_category(tmp_path, order, first)
     rest = {"images": of_images, "annotations": people}
     path = write(tmp_path / "coco.json", {**kinds, **rest} if first else {**rest, **kinds})
     assert is_walk(read_keypoints(path), k)
+
+
+def posenet(p, j):
+    x, y, score = p[j]
+    return {"part": JOINTS[j], "position": {"x": x, "y": y}, "score": score}
+
+
+def labelme(p, j):
+    return {"label": JOINTS[j], "points": [p[j][:2]], "shape_type": "point", "group_id": 1}
+
+
+def label_studio(p, j):
+    value = {"x": p[j][0] / 12.8, "y": p[j][1] / 7.2, "width": 0.4, "keypointlabels": [JOINTS[j]]}
+    return {"original_width": 1280, "original_height": 720, "type": "keypointlabels", "value": value}
+
+
+def tfjs(p, j):
+    return {"name": JOINTS[j], "x": p[j][0], "y": p[j][1], "score": p[j][2]}
+
+
+@pytest.mark.parametrize(("key", "form", "box"), [
+    ("keypoints", posenet, None), ("keypoints", tfjs, None),
+    ("shapes", labelme, {"label": "person", "points": [[1, 2], [30, 40]], "shape_type": "rectangle"}),
+    ("result", label_studio, {"original_width": 1280, "value": {"width": 9, "rectanglelabels": ["a"]}}),
+])  # fmt: skip
+@pytest.mark.parametrize("shuffled", [True, False])
+@pytest.mark.parametrize("folder", [True, False])
+def test_named_points_may_come_in_any_order_and_number(tmp_path, key, form, box, shuffled, folder):
+    k = walk(20)
+    k[0, 2:5] = k[7, 9:16] = k[13, :3] = 0.0
+    rng, nodes = np.random.default_rng(0), []
+    for p in k.tolist():
+        order = rng.permutation(17).tolist() if shuffled else range(17)
+        nodes.append({key: [form(p, j) for j in order if p[j][2]] + [box] * (box is not None)})
+    (tmp_path / "json").mkdir()
+    for i, node in enumerate(nodes):
+        write(tmp_path / "json" / f"f_{i:04d}.json", {"imagePath": f"f_{i:04d}.jpg", **node})
+    path = tmp_path / "json" if folder else write(tmp_path / "k.json", nodes)
+    found = read_keypoints(path, Stated(15.0, SIZE))
+    at = [found.joints.index(joint) for joint in JOINTS]
+    seen = k[..., 2] > 0
+    assert (np.isfinite(found.keypoints[:, at]).all(axis=2) == seen).all()
+    assert np.abs(found.keypoints[:, at] - k[..., :2])[seen].max() < 0.01
+
+
+@pytest.mark.parametrize("shuffled", [True, False])
+def test_a_long_table_may_lack_joints(tmp_path, shuffled):
+    k = walk(20)
+    k[3, 9:14] = k[11, 0] = 0.0
+    cells = [[i, n, *v] for i, p in enumerate(k) for n, v in zip(JOINTS, rows(p), strict=True) if v[2]]
+    if shuffled:
+        cells = [cells[i] for i in np.random.default_rng(0).permutation(len(cells))]
+    head = ["frame", "landmark", "x", "y", "confidence"]
+    found = read_keypoints(
+        text(tmp_path / "k.csv", "\n".join(",".join(map(str, row)) for row in [head, *cells])), Stated(15.0, SIZE)
+    )
+    at = [found.joints.index(joint) for joint in JOINTS]
+    seen = k[..., 2] > 0
+    assert (np.isfinite(found.keypoints[:, at]).all(axis=2) == seen).all()
+    assert np.abs(found.keypoints[:, at] - k[..., :2])[seen].max() < 0.01
