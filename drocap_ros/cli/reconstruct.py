@@ -418,9 +418,12 @@ def view_words(motion: Motion) -> str:
 
 def _check(args: argparse.Namespace, inputs: list[Path]) -> None:
     """Refuse recordings without the option, the option without them, and options of one recording."""
+    from drocap_ros.perception.sources.image_files import SUFFIXES
     from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
     if not args.together:
+        if all(path.suffix.lower() in SUFFIXES for path in inputs):
+            raise InputError(f"INPUT: expected one, found {len(inputs)} images; name their folder {inputs[0].parent}")
         raise InputError(
             f"INPUT: expected one, found {len(inputs)}; add --together where all show one person at the same time, else"
             " use `drocap batch`"

@@ -15,7 +15,7 @@ from recorded import NAMES, START_NS, random_image, record
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.recording.image_messages import read_images
+from drocap_ros.recording.image_messages import image_from_message, read_images
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.other_poses import read_other_poses
 from drocap_ros.recording.pose_messages import lens_of
@@ -289,3 +289,19 @@ def test_a_preview_is_not_taken_for_the_picture(tmp_path, messages, small, large
     with open_session(tmp_path / "s") as session:
         assert next(read_images(session)).image.shape[1] == wanted
         assert "several topics of images" in session.warnings[0]
+
+
+@pytest.mark.parametrize(("encoding", "count"), [
+    ("BGR8", 3), ("bgr", 3), ("Bgra8", 4), ("gray8", 1), ("GREY", 1), ("Y8", 1), ("mono", 1), (" bgr8", 3), ("y16", 2),
+])  # fmt: skip
+@pytest.mark.parametrize("step", [True, False])
+def test_raw_images_are_read_in_other_spellings_and_without_a_step(messages, encoding, count, step):
+    shape = (48, 64) if count in (1, 2) else (48, 64, count)
+    pixels = np.random.default_rng(0).integers(0, 255, shape, np.uint8).astype(np.uint16 if count == 2 else np.uint8)
+    header, data = messages.header(START_NS), pixels.view(np.uint8).ravel()
+    message = messages(NAMES["image"], header=header, height=48, width=64, encoding=encoding, data=data,
+                       step=64 * count * step)  # fmt: skip
+    image = image_from_message(message)
+    assert image.shape == (48, 64, 3)
+    if count != 2:
+        assert (image == (pixels[..., :3] if pixels.ndim == 3 else pixels[..., None])).all()

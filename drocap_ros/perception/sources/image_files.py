@@ -50,7 +50,8 @@ _PACKED = dict.fromkeys(("yuv422", "uyvy"), "COLOR_YUV2BGR_UYVY")
 _PACKED |= dict.fromkeys(("yuv422_yuy2", "yuyv", "yuy2"), "COLOR_YUV2BGR_YUYV")
 #: Luma, then chroma of half the rows.
 _PLANAR = {"nv12": "NV12", "nv21": "NV21", "i420": "I420", "yuv420": "I420", "yuv420p": "I420", "yv12": "YV12"}
-_NAMED = re.compile(r"(bgra?|rgba?|mono|bayer_[rgb]{4})_?(8|10|12|14|16)")
+_NAMED = re.compile(r"(bgra?|rgba?|mono|gr[ae]y|y|bayer_[rgb]{4})_?(8|10|12|14|16)?")
+_GREYS = dict.fromkeys(("gray", "grey", "y"), "mono")
 _TYPED = re.compile(r"(8U|16U|32F)C([134])")
 _DEPTH = re.compile(r"16[US]C1|32FC1|64FC1|.*compressedDepth.*")
 _GREY = re.compile(r"mono|8UC1")
@@ -121,6 +122,7 @@ def raw_to_bgr(data: np.ndarray, size: tuple[int, int], step: int, encoding: str
 def _rows(data: np.ndarray, shape: tuple[int, int], step: int, words: str) -> np.ndarray:
     """(rows, bytes) of data whose rows are ``step`` bytes apart."""
     rows, width = shape
+    step = step or width  # as some drivers leave it
     if not 0 < rows * width <= _MAX_PIXELS * 16 or step < width or data.size < rows * step:
         raise InputError(f"image: expected {rows} rows of {step} bytes for {words}, got {data.size} bytes")
     return data[: rows * step].reshape(rows, step)[:, :width]
@@ -155,8 +157,8 @@ def _layout(encoding: str) -> tuple[int, str | None, np.dtype]:
         return 2, _PACKED[encoding.lower()], np.dtype("u1")
     if typed := _TYPED.fullmatch(encoding):
         order, kind = _OF_CHANNELS[typed[2]], {"8U": "u1", "16U": "u2", "32F": "f4"}[typed[1]]
-    elif (named := _NAMED.fullmatch(encoding)) and named[1] in _ORDERS:
-        order, kind = named[1], "u1" if named[2] == "8" else "u2"
+    elif (named := _NAMED.fullmatch(encoding.strip().lower())) and (order := _GREYS.get(named[1], named[1])) in _ORDERS:
+        kind = "u1" if named[2] in (None, "8") else "u2"
     else:
         known = (*(f"{name}8 or 16" for name in _ORDERS), *_PACKED, *_PLANAR, "8UC3 and the like")
         raise InputError(f"image: expected encoding {', '.join(known)}, got {encoding[:40]!r}; convert it")
@@ -315,6 +317,14 @@ def of_one_recording(images: list[Image], names: list[str]) -> tuple[list[Image]
     best = min(kinds, key=lambda kind: (bool(NO_PICTURE.search("".join(kind))), -len(kinds[kind])))
     there = ", ".join(f"{begin}*{end} ({len(of)})" for (begin, end), of in kinds.items())
     return kinds[best], f"several recordings, {there}: {'*'.join(best)} is used, another where it is alone"
+
+
+def is_mjpeg(path: Path) -> bool:
+    """Whether a file holds JPEG images one after the other, as simple cameras write them: a video without a container.
+
+    Cameras append a preview to a picture: two are none.
+    """
+    return path.is_file() and path.read_bytes().count(b"\xff\xd9\xff\xd8\xff") > 1
 
 
 def _pictures_in(path: Path) -> int:

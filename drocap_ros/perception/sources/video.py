@@ -16,6 +16,7 @@ import numpy as np
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.file_kind import FileKind, file_kind, unpacking
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
+from drocap_ros.perception.sources.image_files import is_mjpeg
 
 if TYPE_CHECKING:
     import av
@@ -58,11 +59,12 @@ def pyav() -> Any:
     )
 
 
-def open_container(path: Path) -> InputContainer:
+def open_container(path: Path, form: str | None = None) -> InputContainer:
     """The container of a video file, which no other file or address can take part in."""
     av = pyav()
     # An absolute path is never taken for a protocol.
-    return av.open(str(path.absolute()), options={"protocol_whitelist": "file"}, metadata_errors="replace")  # type: ignore[no-any-return]
+    whitelist = {"protocol_whitelist": "file"}
+    return av.open(str(path.absolute()), format=form, options=whitelist, metadata_errors="replace")  # type: ignore[no-any-return]
 
 
 def codec_of(name: str) -> str | None:
@@ -166,11 +168,11 @@ class VideoSource(ImageSource):
         self.path, self._track = path, track
         if not path.is_file():
             raise InputError(f"{path}: expected a video file, found no such file; check the path")
-        if (kind := file_kind(path)) is not FileKind.VIDEO:
+        if (kind := file_kind(path)) is not FileKind.VIDEO and not (kind is FileKind.IMAGE and is_mjpeg(path)):
             raise InputError(f"{path}: expected a video file, found {kind.value}{unpacking(path)}")
         self._error = pyav().error.FFmpegError
         try:
-            self._container = open_container(path)
+            self._container = open_container(path, None if kind is FileKind.VIDEO else "mjpeg")
         except self._error as error:
             raise InputError(
                 f"{path}: expected a video that FFmpeg can open, found {path.stat().st_size} bytes without a readable"

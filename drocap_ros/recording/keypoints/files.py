@@ -181,7 +181,10 @@ def _pixels(xy: np.ndarray, size: tuple[int, int] | None, spatial: bool) -> np.n
         )
     if high <= _LARGEST_SHARE:
         if size is None:
-            raise InputError(f"expected px, found shares of the picture{hint}; give its size with --image-size WxH")
+            raise InputError(
+                f"expected px, found shares of the picture{hint}; give `drocap reconstruct` its size with --image-size"
+                " WxH"
+            )
         return xy * size
     seen = xy[np.isfinite(xy).any(axis=(1, 2))]
     extent = float(np.median(np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1), axis=0).max())

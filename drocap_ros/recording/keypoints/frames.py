@@ -51,7 +51,8 @@ def one_person(
 def numbers_of(labels: list[Label]) -> dict[Label, int]:
     """Number of each frame: the last one in its name where that tells frames apart, else its place."""
     names = list(dict.fromkeys(labels))
-    found = [re.findall(r"\d+", Path(n).stem if isinstance(n, str) else str(n))[-1:] for n in names]
+    whole = [int(n) if isinstance(n, float) and n.is_integer() else n for n in names]
+    found = [re.findall(r"\d+", Path(n).stem if isinstance(n, str) else str(n))[-1:] for n in whole]
     # Digits of a frame's number; longer ones are times or sums.
     numbers = [int(digits[0]) for digits in found if digits and len(digits[0]) < 10]
     return dict(zip(names, numbers if len(set(numbers)) == len(names) else range(len(names)), strict=True))

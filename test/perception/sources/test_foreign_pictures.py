@@ -172,3 +172,14 @@ def test_images_of_another_shape_on_the_way_are_told(tmp_path, caplog, size, tol
     with open_source(tmp_path / "c.ts") as source:
         assert {frame.image.shape for frame in source} == {(48, 64, 3)}
     assert ("shape of the images changes" in caplog.text) == told
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 40])
+@pytest.mark.parametrize("name", ["a.mjpeg", "a.jpg"])
+def test_pictures_one_after_the_other_are_a_video(tmp_path, count, name):
+    """As simple cameras write them; two are a picture and its preview."""
+    pictures = [cv2.imencode(".jpg", picture(5 * i))[1].tobytes() for i in range(count)]
+    (tmp_path / name).write_bytes(b"".join(pictures))
+    stamps, values = read(tmp_path / name)
+    assert len(stamps) == (1 if count < 3 else count)
+    assert values == sorted(values)

@@ -332,3 +332,16 @@ def test_a_long_table_may_lack_joints(tmp_path, shuffled):
     seen = k[..., 2] > 0
     assert (np.isfinite(found.keypoints[:, at]).all(axis=2) == seen).all()
     assert np.abs(found.keypoints[:, at] - k[..., :2])[seen].max() < 0.01
+
+
+@pytest.mark.parametrize("number", [float, int, str, lambda i: f"{i:.1f}", lambda i: f"C:\\walk\\f_{i:06d}.jpg"])
+@pytest.mark.parametrize("shuffled", [True, False])
+def test_numbers_of_frames_are_numbers_however_they_are_written(tmp_path, number, shuffled):
+    k, at = walk(12), [*range(5, 11), *range(14, 20)]
+    nodes = [{"frame": number(i), "keypoints": flat(p)} for i, p in zip(at, k, strict=True)]
+    if shuffled:
+        nodes = [nodes[i] for i in np.random.default_rng(0).permutation(12)]
+    found = read_keypoints(write(tmp_path / "k.json", nodes), Stated(15.0, SIZE))
+    assert len(found) == 15
+    assert np.isnan(found.keypoints[6:9]).all()
+    assert np.abs(found.keypoints[[i - 5 for i in at]] - k[..., :2]).max() < 0.01
