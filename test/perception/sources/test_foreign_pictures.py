@@ -183,3 +183,10 @@ def test_pictures_one_after_the_other_are_a_video(tmp_path, count, name):
     stamps, values = read(tmp_path / name)
     assert len(stamps) == (1 if count < 3 else count)
     assert values == sorted(values)
+
+
+def test_info_tells_what_a_folder_of_pictures_holds(tmp_path, capsys):
+    folder_of(tmp_path / "a", {f"f_{i:03d}.png": picture(9) for i in range(31)})
+    assert main(["info", str(tmp_path / "a")]) == 0
+    out = capsys.readouterr().out
+    assert all(words in out for words in ("images: 31", "32x24 px", "duration: 1.000 s"))
