@@ -18,7 +18,9 @@ import numpy as np
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.recording.telemetry.log import (
+    Lack,
     LogFormat,
+    LogLack,
     Series,
     TelemetryLog,
     dji_attitude,
@@ -69,7 +71,7 @@ def read_airdata(path: Path) -> TelemetryLog:
     found, lacks = plausible(path, Series(stamp_ns, gimbal, table.columns(*_AIRCRAFT), geodetic))
     utc_s = table.columns("utc")[:, 0] - stamp_ns * 1e-9
     lens, zoom = lens_of_views(table.columns("view")[:, 0], "as the log states")
-    lacks += zoom
+    lacks += [*zoom, *table.lacks]
     video = true_runs(table.columns("video")[:, 0] == 1)
     body, camera = dji_attitude(found.aircraft), dji_attitude(found.gimbal)
     place = from_first_fix(found.geodetic, above_takeoff=True)
@@ -103,7 +105,14 @@ class _Table:
         time_ms = table[:, self._names.index("time")]
         # A later time than eleven days is damage.
         table = table[(time_ms >= 0) & (time_ms < 1e9)]
-        self._rows = table[np.unique(table[:, self._names.index("time")], return_index=True)[1]]
+        at, self.lacks = self._names.index("time"), list[LogLack]()
+        # Where the time begins anew another flight does.
+        flights = np.split(table, np.flatnonzero(np.diff(table[:, at]) < -1000) + 1)
+        if 1 < len(flights) < len(table) / 10:
+            table = max(flights, key=len)
+            words = f"flights in the log, of {', '.join(map(str, map(len, flights)))} rows: the longest is used"
+            self.lacks.append(LogLack(Lack.SEVERAL, words))
+        self._rows = table[np.unique(table[:, at], return_index=True)[1]]
         if not len(self._rows):
             raise InputError(f"{path}: expected rows with a time, found none; export the flight again")
 

@@ -177,3 +177,16 @@ def test_a_view_that_changes_is_no_lens(tmp_path, first, last, steady):
     log = read_telemetry(tmp_path / "z.csv")
     assert (log.lens is not None) == steady
     assert any(lack.kind is Lack.ZOOM for lack in log.lacks) != steady
+
+
+@pytest.mark.parametrize("lengths", [(400, 120), (60, 400), (100, 90, 400, 30)])
+def test_the_longest_of_several_flights_in_a_table_is_used(tmp_path, lengths):
+    lines = write_airdata(tmp_path / "f.csv", [(1.0, 30.0)]).read_text("utf-8-sig").splitlines()
+    (tmp_path / "all.csv").write_text("\n".join([lines[0], *(line for n in lengths for line in lines[1 : n + 1])]))
+    log = read_telemetry(tmp_path / "all.csv")
+    alone = read_telemetry(tmp_path / "f.csv")
+    assert np.array_equal(log.track.stamp_ns, alone.track.stamp_ns[: max(lengths)])
+    assert np.allclose(log.track.gimbal, alone.track.gimbal[: max(lengths)])
+    assert any(lack.kind is Lack.SEVERAL for lack in log.lacks)
+    (tmp_path / "turned.csv").write_text("\n".join([lines[0], *lines[:0:-1]]))
+    assert np.array_equal(read_telemetry(tmp_path / "turned.csv").track.stamp_ns, alone.track.stamp_ns)
