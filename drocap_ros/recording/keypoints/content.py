@@ -50,6 +50,8 @@ _SPACE = re.compile(r"3d|world|xyz", re.IGNORECASE)
 _LEAST, _MOST = 5, 600
 #: Both coordinates of a missing point: 0, -1, -9999, or such a large one.
 _CODE = 9999.0
+#: Scores beyond it are no shares of one: some networks exceed 1 a little, and COCO's flags end there.
+HIGHEST_SCORE = 2.0
 #: No camera has larger images, px.
 LARGEST_PX = 1e5
 
@@ -242,10 +244,18 @@ def _points(value: list[object], scores: object) -> np.ndarray | None:
     try:
         points = np.array(_rows(value), dtype=np.float64)
         if points.ndim == 1:  # x y score of each, or x y
-            points = points.reshape(-1, 3 if len(points) % 3 == 0 and len(points) // 3 in counts() else 2)
+            points = points.reshape(-1, _each(points))
         return _scored(points, scores) if points.ndim == 2 else None
     except (ValueError, TypeError, OverflowError, AttributeError):
         return None
+
+
+def _each(values: np.ndarray) -> int:
+    """Numbers of each point of (..., N): with a score where a third could be one, else two; 66 are 33 or 22 points."""
+    count = values.shape[-1]
+    fitting = [n for n in (3, 2) if count % n == 0 and count // n in counts()]
+    is_score = np.nanmax(np.abs(values[..., 2::3]), initial=0.0) <= HIGHEST_SCORE
+    return 2 if not fitting or (len(fitting) > 1 and not is_score) else fitting[0]
 
 
 def _rows(value: list[object]) -> list[object]:
@@ -314,6 +324,6 @@ def _in_frames(value: np.ndarray) -> np.ndarray:
         return np.moveaxis(value, 1, 2)
     if value.ndim == 2 and value.shape[1] in (2, 3):
         return value[None]
-    columns = value.shape[1] if value.ndim == 2 else 1
-    each = next((n for n in (3, 2) if columns % n == 0 and columns // n in counts()), 0)
-    return value.reshape(len(value), -1, each) if each else value
+    if value.ndim == 2 and value.shape[1] % (each := _each(value)) == 0 and value.shape[1] // each in counts():
+        return value.reshape(len(value), -1, each)
+    return value

@@ -19,14 +19,14 @@ import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.perception.sources.image_files import SUFFIXES, natural, of_one_recording
-from drocap_ros.recording.keypoints.content import LARGEST_PX, Content, read_arrays, walk
+from drocap_ros.recording.keypoints.content import HIGHEST_SCORE, LARGEST_PX, Content, read_arrays, walk
 from drocap_ros.recording.keypoints.frames import (
     Label,
     numbers_of,
     one_person,
     seconds_of,
 )
-from drocap_ros.recording.keypoints.orders import name_points
+from drocap_ros.recording.keypoints.orders import counts, name_points
 from drocap_ros.recording.keypoints.tables import is_keypoint_table, read_json, read_table, read_yolo
 from drocap_ros.tracks import MAX_FRAMES, Tracks, kind_of, load_tracks, read_npz, save_tracks, without_unseen
 
@@ -37,9 +37,8 @@ _OWN = {"joints", "stamp_ns", "image_size"}
 _ARRAYS = (".npz", ".npy")
 #: Images per second, assumed where a file does not say.
 _USUAL_HZ = 30.0
-#: Coordinates that are all within the first are shares of the picture.  Scores beyond the second are no shares of one:
-#: some networks exceed 1 a little, and COCO's flags end there.
-_LARGEST_SHARE, _HIGHEST_SCORE = 2.0, 2.0
+#: Coordinates that are all within it are shares of the picture.
+_LARGEST_SHARE = 2.0
 
 
 def is_keypoint_file(path: Path) -> bool:
@@ -134,9 +133,9 @@ def _tracks(path: Path, content: Content, stated: Stated) -> Tracks:
     rate_hz, size = stated.rate_hz or content.rate_hz, stated.size or content.size
     at_s = None if rate_hz else seconds_of(content.times, frames)
     scores, third = np.nan_to_num(points[..., 2]), points[..., 3]
-    if scores.max(initial=0.0) > _HIGHEST_SCORE:  # per cent, or a heat map's unit
+    if scores.max(initial=0.0) > HIGHEST_SCORE:  # per cent, or a heat map's unit
         scores = scores / scores.max()
-    spatial = content.space or bool((third < 0).any() or np.nanmax(third, initial=0.0) > _HIGHEST_SCORE)
+    spatial = content.space or bool((third < 0).any() or np.nanmax(third, initial=0.0) > HIGHEST_SCORE)
     if stated.size is None and size is not None and np.nanpercentile(points[..., :2], 90) > 1.2 * max(size):
         size = None  # of something else than the picture
     xy = _pixels(points[..., :2], size, spatial)
@@ -200,11 +199,12 @@ def _series(path: Path, content: Content, subject: int | None) -> tuple[np.ndarr
         more = [((0, len(content.names) - len(points)), (0, 0)) for _, _, points in content.people]
         content.people = [(f, who, np.pad(points, pad, constant_values=np.nan) if pad[0][1] > 0 else points)
                           for (f, who, points), pad in zip(content.people, more, strict=True)]  # fmt: skip
-    counted = Counter(len(points) for _, _, points in content.people)
+    counted = Counter(n for _, n in {(f, len(p)) for f, _, p in content.people})
     if not counted:
         found = "3D poses; take the 2D keypoints of the pictures" if content.space else "none; check the file"
         raise InputError(f"expected 2D keypoints of a person, found {found}")
-    count = counted.most_common(1)[0][0]
+    # Hands and faces may stand beside a body.
+    count = max(counted, key=lambda n: (counted[n], n in (len(content.names), *counts()), n))
     frames, people = _by_time(path, content, count)
     chosen, words = one_person(people, subject)
     if words:

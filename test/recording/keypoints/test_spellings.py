@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from orders_of_points import in_order, views
 from test_keypoint_files import SIZE, flat, rows, text, walk, write
 
 from drocap_ros.cli import main
@@ -345,3 +346,37 @@ def test_numbers_of_frames_are_numbers_however_they_are_written(tmp_path, number
     assert len(found) == 15
     assert np.isnan(found.keypoints[6:9]).all()
     assert np.abs(found.keypoints[[i - 5 for i in at]] - k[..., :2]).max() < 0.01
+
+
+@pytest.mark.parametrize("order", ["mediapipe33", "coco17", "openpose25", "smpl24", "halpe26", "mpii16", "coco21"])
+@pytest.mark.parametrize("scores", [True, False])
+@pytest.mark.parametrize("form", ["json", "npy"])
+def test_flat_numbers_are_pairs_or_have_scores(tmp_path, order, scores, form):
+    """66 numbers are 33 points, or 22 with their scores."""
+    xy = in_order(views(seconds=1.0)[2], order, np.random.default_rng(0))
+    values = np.concatenate([xy, np.full((*xy.shape[:2], 1), 0.8)], axis=2) if scores else xy
+    if form == "json":
+        path = write(tmp_path / "k.json", [{"keypoints": row} for row in values.reshape(len(xy), -1).tolist()])
+    else:
+        path = tmp_path / "k.npy"
+        np.save(path, values.reshape(len(xy), -1))
+    found = read_keypoints(path, Stated(30.0, SIZE, order))
+    assert np.abs(found.keypoints - xy[:, : found.keypoints.shape[1]]).max() < 0.01
+
+
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("names", [("pose", "left_hand", "right_hand", "face"), ("body", "lh", "rh", "mesh")])
+def test_a_body_is_told_from_hands_and_a_face(tmp_path, first, names):
+    xy = in_order(views(seconds=1.0)[2], "mediapipe33", np.random.default_rng(0))
+    rng, nodes = np.random.default_rng(1), []
+    for i, p in enumerate(xy):
+        parts = [
+            p,
+            p[15] + rng.normal(0, 5, (21, 2)),
+            p[16] + rng.normal(0, 5, (21, 2)),
+            p[0] + rng.normal(0, 5, (468, 2)),
+        ]
+        parts = {name: part.tolist() for name, part in zip(names, parts, strict=True) if i % 5 or name != names[1]}
+        nodes.append(parts if first else dict(reversed(parts.items())))
+    found = read_keypoints(write(tmp_path / "k.json", nodes), Stated(30.0, SIZE))
+    assert np.abs(found.keypoints - xy[:, : found.keypoints.shape[1]]).max() < 0.01
