@@ -305,3 +305,19 @@ def test_raw_images_are_read_in_other_spellings_and_without_a_step(messages, enc
     assert image.shape == (48, 64, 3)
     if count != 2:
         assert (image == (pixels[..., :3] if pixels.ndim == 3 else pixels[..., None])).all()
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize(
+    "form", ["bayer_{}8; jpeg compressed ", "bayer_{}8; png compressed", "bayer_{}8;jpeg compressed bgr8"]
+)
+def test_a_compressed_mosaic_becomes_a_picture(messages, pattern, form):
+    colour = np.full((48, 64, 3), (40, 90, 200), np.uint8)  # blue green red
+    picture = colour
+    if not form.endswith("bgr8"):  # else the publisher has made a picture of it
+        picture = np.empty((48, 64), np.uint8)
+        for i, letter in enumerate(pattern):
+            picture[i // 2 :: 2, i % 2 :: 2] = dict(zip("bgr", colour[0, 0], strict=True))[letter]
+    data = cv2.imencode(".png", picture)[1].ravel()
+    message = messages(NAMES["compressed"], header=messages.header(START_NS), format=form.format(pattern), data=data)
+    assert np.abs(image_from_message(message)[4:-4, 4:-4].astype(int) - colour[4:-4, 4:-4]).max() < 3

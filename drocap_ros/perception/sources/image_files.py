@@ -97,7 +97,10 @@ def decoded(data: np.ndarray, form: str) -> np.ndarray:
         image = None
     if image is None:
         raise InputError(f"image: expected JPEG, PNG or another image, got format {form[:40]!r} that does not decode")
-    return to_bgr(np.asarray(image))
+    pixels, named = to_bgr(np.asarray(image)), _NAMED.match(form.strip().lower())
+    if named and named[1].startswith("bayer") and (pixels[..., :1] == pixels).all():  # a sensor's mosaic as grey
+        return np.asarray(cv2.cvtColor(pixels[..., 0], getattr(cv2, str(_ORDERS[named[1]][1]))))
+    return pixels
 
 
 def raw_to_bgr(data: np.ndarray, size: tuple[int, int], step: int, encoding: str, big_endian: bool) -> np.ndarray:
