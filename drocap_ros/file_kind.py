@@ -25,8 +25,6 @@ class FileKind(Enum):
 
 
 RECORDINGS = frozenset({FileKind.MCAP, FileKind.ROSBAG1, FileKind.SQLITE})
-#: First bytes of raw video: the only one whose head may look like text.
-_Y4M = b"YUV4MPEG2 "
 #: The first bytes of each kind, the first match counts.  Text that FFmpeg takes for a video (playlists, its terminal
 #: demuxer) is in no line.
 _HEADS = [
@@ -61,13 +59,14 @@ def file_kind(path: Path) -> FileKind:
     if not head:
         return FileKind.EMPTY
     found, begins = next(((kind, match[0]) for kind, pattern in _HEADS if (match := pattern.match(head))), (None, b""))
-    if found is FileKind.VIDEO and begins != _Y4M and _is_text(begins) and _is_text(head):
+    # The head of raw video alone may look like text.
+    if found is FileKind.VIDEO and begins != b"YUV4MPEG2 " and _is_text(begins) and _is_text(head):
         return FileKind.TEXT  # "The free text" begins as a box `free` does
     return found or (FileKind.TEXT if _is_text(head) else FileKind.OTHER)
 
 
 #: A stream's or web page's address, whose slashes a path has lost.
-_ADDRESS = re.compile(r"([a-z]+):/+(?=[^/])", re.IGNORECASE)
+_ADDRESS = re.compile(r"([a-z][a-z\d+]+):/+(?=[^/])", re.IGNORECASE)
 
 
 def missing(path: Path, expected: str) -> InputError:
@@ -78,17 +77,19 @@ def missing(path: Path, expected: str) -> InputError:
     return InputError(f"{path}: expected {expected}, found no such file or folder; check the path")
 
 
-#: Ends of the names of packed files -> the command that unpacks one.
+#: Ends of the names of packed files -> the command that unpacks one; of others -> what to do with one.
 _UNPACK = {
     ".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".tgz": "tar -xf", ".tar": "tar -xf", ".bz2": "bunzip2",
     ".xz": "unxz", ".lz4": "unlz4", ".zip": "unzip", ".7z": "7z x", ".rar": "unrar x",
 }  # fmt: skip
+_OTHERS = {".npz": "see what is in it: drocap info", ".xml": "export COCO Keypoints instead of"}
 
 
 def unpacking(path: Path) -> str:
     """What to do with a file that is none of the kinds that are read, after a sentence about it."""
-    command = _UNPACK.get(path.suffix.lower())
-    return f"; unpack it: {command} {path}" if command else "; check the file, or record it again"
+    end = path.suffix.lower()
+    words = f"unpack it: {_UNPACK[end]}" if end in _UNPACK else _OTHERS.get(end)
+    return f"; {words} {path}" if words else "; check the file, or record it again"
 
 
 def _is_text(head: bytes) -> bool:

@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drocap_ros.cli.options import LineParser, Subparsers, add_command, add_quiet_option
+from drocap_ros.cli.options import LineParser, Subparsers, add_command, add_quiet_option, clip_of
 from drocap_ros.cli.reconstruct import add_options
 from drocap_ros.errors import InputError
 
@@ -109,12 +109,17 @@ def _read_tasks(args: argparse.Namespace) -> list[Task]:
 
 
 def _check_files(defaults: argparse.Namespace) -> None:
-    """Refuse a missing file of an option before the work."""
+    """Refuse options that no recording can have, and a missing file of one, before the work."""
+    from drocap_ros.cli.reconstruct import attitude_of, with_known
+    from drocap_ros.config import load_config
     from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
     for name, value in vars(defaults).items():
         if isinstance(value, Path) and name != "models" and value != NO_TELEMETRY and not value.exists():
             raise InputError(f"--{name} {value}: no such file; check the path")
+    clip_of(defaults)
+    attitude_of(defaults)
+    with_known(load_config(defaults.config), defaults)
 
 
 def _resolved(arguments: argparse.Namespace) -> argparse.Namespace:
@@ -208,6 +213,8 @@ _RECORDINGS = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".wmv", ".mjpeg",
 )  # fmt: skip
 _LIST = ".txt"
+#: Folders in which systems keep small pictures and remains.
+_OF_SYSTEMS = re.compile(r"@eaDir|__MACOSX|\$RECYCLE\.BIN|System Volume Information|lost\+found", re.IGNORECASE)
 
 
 def read_inputs(words: Iterable[str], defaults: argparse.Namespace) -> list[argparse.Namespace]:
@@ -268,7 +275,7 @@ def _in_folder(folder: Path) -> list[Path]:
     if (folder / METADATA_FILE).is_file():
         return [folder]
     entries = sorted(folder.glob("[!.]*"))
-    folders = [path for path in entries if path.is_dir() and not path.is_symlink()]
+    folders = [p for p in entries if p.is_dir() and not p.is_symlink() and not _OF_SYSTEMS.fullmatch(p.name)]
     inside = list(itertools.chain.from_iterable(map(_in_folder, folders)))
     if (folder / "motion.npz").exists():  # the files are a result
         return inside

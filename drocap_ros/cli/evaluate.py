@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -46,12 +47,22 @@ def _add_compare(kinds: Subparsers) -> None:
     parser.add_argument(
         "--time-offset",
         metavar="S|find",
-        type=lambda text: float("nan") if text == "find" else float(text),
+        type=_offset,
         help="seconds from the truth's first frame to the motion's; find: by the poses (default: by the clocks of both,"
         " where their times overlap, else find)",
     )
     add_out(parser, "compare.csv, compare.md and compare.png")
     parser.set_defaults(run=_compare)
+
+
+def _offset(text: str) -> float:
+    """Type of ``--time-offset``; NaN is to be found."""
+    try:
+        if text == "find" or math.isfinite(float(text)):
+            return math.nan if text == "find" else float(text)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"expected seconds or find, got {text}")
 
 
 def _add_table(kinds: Subparsers) -> None:

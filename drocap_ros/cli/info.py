@@ -169,10 +169,22 @@ def summarize(path: Path) -> Summary:
             raise missing(path, "a recording, motion or tracks file")
         raise InputError(f"{path}: expected a recording, motion or tracks file, found a pipe or device; name a file")
     path = _motion_in(path)
+    from drocap_ros.perception.sources import open_source
+    from drocap_ros.perception.sources.image_files import SUFFIXES
     from drocap_ros.recording.keypoints.files import is_keypoint_file
+    from drocap_ros.recording.open_session import is_recording
 
     if is_keypoint_file(path):
         return _of_arrays(path)
+    if (
+        path.is_dir()
+        and not is_recording(path)
+        and not SUFFIXES.isdisjoint(p.suffix.lower() for p in path.glob("[!.]*"))
+    ):
+        with open_source(path) as images:
+            size = f"{images.size[0]}x{images.size[1]} px"
+            facts = [("path", str(path)), ("kind", f"images: {images.length}"), ("image", size)]
+            return Summary([*facts, ("duration", f"{images.duration_s:.3f} s")])
     return telemetry_summary(path) if is_video_or_log(path) else _of_session(path)
 
 

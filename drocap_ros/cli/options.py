@@ -35,7 +35,13 @@ class LineParser(argparse.ArgumentParser):
     ) -> tuple[argparse.Namespace, list[str]]:
         """As of argparse; refuses unknown words and empty ones: the path of an unset variable is this directory."""
         words = sys.argv[1:] if args is None else list(args)
-        found, unknown = super().parse_known_args(words, namespace)
+        try:
+            found, unknown = super().parse_known_args(words, namespace)
+        except InputError as error:
+            dashed = next((word for word in words if word[:1] == "-" and Path(word).exists()), None)
+            if dashed and f"./{dashed}" not in str(error):
+                raise InputError(f"{error}; the file {dashed} is named ./{dashed}") from None
+            raise
         if unknown:
             alike = did_you_mean(unknown[0], self._option_string_actions)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{alike}")

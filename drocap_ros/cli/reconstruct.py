@@ -55,7 +55,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="video file, image folder, .mcap, rosbag1 .bag, rosbag2 folder, tracks .npz, or 2D keypoints of another"
         " tool (.json or a folder of them, .csv, .npz, .npy); with --together several",
     )
-    parser.add_argument("further", metavar="INPUT", nargs="*", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("further", metavar="INPUT", nargs="*", default=[], type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: INPUT's name + _motion)")
     parser.add_argument(
         "--together",
@@ -196,8 +196,6 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     person, rule = parse_subject(args.subject if people is None else "")
     rule |= {"feet_model": args.feet} if args.feet else {}
     config = with_known(load_config(args.config), args).replace("pose_estimator", **rule)
-    if args.dictionary:
-        config = config.replace("initializer", dictionary=str(args.dictionary))
     telemetry = _telemetry(args)
     video, said = next(iter(videos_of(args, [args.input])), None), corrections_of(args, people)
     with (
@@ -206,6 +204,8 @@ def run(args: argparse.Namespace, people: tuple[int, ...] | None = None) -> int:
     ):
         if needs_networks(source, args.redetect):
             ensure_networks(models_folder(args.models or config.pose_estimator.models_dir), source, args)
+        elif args.redetect:
+            raise InputError(f"--redetect: expected a recording with images, found {args.input}; leave it out")
         elif args.topic:
             raise InputError(
                 f"--topic {args.topic}: expected images, found recorded 2D poses; add --redetect, or leave it out"
@@ -265,10 +265,11 @@ def _telemetry(args: argparse.Namespace) -> Telemetry:
         _check_offset("--mount-pitch", args.mount_pitch, args, mount=True)
         if abs(args.mount_pitch) > 90.0:
             raise InputError(f"--mount-pitch: expected -90 to 90 deg, got {args.mount_pitch}; choose another")
-    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch, _attitude(args))
+    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch, attitude_of(args))
 
 
-def _attitude(args: argparse.Namespace) -> tuple[float, float] | None:
+def attitude_of(args: argparse.Namespace) -> tuple[float, float] | None:
+    """Pitch and roll of ``--camera-pitch``, ``--camera-roll`` or ``--level``, deg; None where nothing is said."""
     if args.level and (args.camera_pitch or args.camera_roll):
         raise InputError("--level: expected neither --camera-pitch nor --camera-roll beside it; leave one of them out")
     if args.camera_pitch is None and args.camera_roll is None:
@@ -286,6 +287,10 @@ def with_known(config: DrocapConfig, args: argparse.Namespace) -> DrocapConfig:
     ):  # fmt: skip
         if value is not None and not low <= value <= high:
             raise InputError(f"{name}: expected {low:g} to {high:g}, got {value:g}; correct it")
+    if args.dictionary is not None:
+        if not args.dictionary.is_file():
+            raise InputError(f"--dictionary {args.dictionary}: expected a pose dictionary, found no file; correct it")
+        config = config.replace("initializer", dictionary=str(args.dictionary))
     if args.height is not None:
         config = config.replace("initializer", assumed_height_m=args.height)
         config = config.replace("bundle_adjuster", stature_std=_MEASURED_STATURE)
@@ -356,8 +361,6 @@ def run_together(args: argparse.Namespace) -> int:
     videos = videos_of(args, inputs)
     corrections = corrections_together(args, [FILE, *beside])
     config = with_known(load_config(args.config), args)
-    if args.dictionary:
-        config = config.replace("initializer", dictionary=str(args.dictionary))
     with contextlib.ExitStack() as stack:
         sources = [
             stack.enter_context(as_tracks_file(path, Stated(args.rate, args.image_size, args.order))) for path in inputs
@@ -416,9 +419,12 @@ def view_words(motion: Motion) -> str:
 
 def _check(args: argparse.Namespace, inputs: list[Path]) -> None:
     """Refuse recordings without the option, the option without them, and options of one recording."""
+    from drocap_ros.perception.sources.image_files import SUFFIXES
     from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
     if not args.together:
+        if all(path.suffix.lower() in SUFFIXES for path in inputs):
+            raise InputError(f"INPUT: expected one, found {len(inputs)} images; name their folder {inputs[0].parent}")
         raise InputError(
             f"INPUT: expected one, found {len(inputs)}; add --together where all show one person at the same time, else"
             " use `drocap batch`"

@@ -74,13 +74,14 @@ def run(args: argparse.Namespace) -> int:
     people = people_of(args)
     if args.list and people is not None:
         raise InputError("--list: expected no --all and no --subject beside it, found one; leave it out")
+    clip = clip_of(args)
     person, rule = parse_subject(args.subject if people is None else "")
     rule |= {"feet_model": args.feet} if args.feet else {}
     config = load_config(args.config).replace("pose_estimator", on_loss="wait" if args.wait else "next", **rule)
     folder = models_folder(args.models or config.pose_estimator.models_dir)
     ensure_networks(folder, args.video, args)
     write = _list if args.list else _track if people is None else _track_people
-    selection = Selection(clip_of(args), person, topic=args.topic, people=people or (), threads=args.threads)
+    selection = Selection(clip, person, topic=args.topic, people=people or (), threads=args.threads)
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
         text = write(_Job(args, config, folder, selection, target, progress))
     if not args.quiet:

@@ -11,7 +11,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation import metrics
 from drocap_ros.evaluation.time_offset import find_offset
-from drocap_ros.evaluation.truth_files import load_mocap, read_truth_file
+from drocap_ros.evaluation.truth_files import load_mocap, metres_of, read_truth_file
 from drocap_ros.file_kind import file_kind
 from drocap_ros.motion import Motion, load_motion, motion_file
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, in_body_order, indices
@@ -155,7 +155,7 @@ def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]
             )
         if kind == "MoCap":
             x, fps = load_mocap(path, LIMB_JOINTS, BODY_17)
-            return x / 1000.0, np.arange(len(x)) / fps, "world"
+            return metres_of(path, x), np.arange(len(x)) / fps, "world"
         if kind != "motion":
             raise wrong_kind(path, names, "MoCap or a motion as the truth")
         truth = load_motion(path)

@@ -7,6 +7,7 @@ has by custom, unless the body contradicts them: a line then says what was taken
 from __future__ import annotations
 
 import logging
+import math
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,11 +28,11 @@ logger = logging.getLogger(__name__)
 #: segments in rigs (a segment begins at its joint), names of joints.  In rigs "shoulder" is often the clavicle, "hand"
 #: and "foot" may be ends, "leg" is the shank.
 _ALIASES = {
-    "hip": "hjc fep upleg upperleg thigh femur hip",
+    "hip": "hjc fep upleg upperleg thigh thighbend femur hip",
     "knee": "kjc feo knee lowerleg shin calf tibia leg",
     "ankle": "ajc tio ankle foot",
-    "shoulder": "sjc hup upperarm uparm humerus arm shldr shoulder",
-    "elbow": "ejc huo elbow lowerarm lowarm forearm radius",
+    "shoulder": "sjc hup upperarm uparm humerus arm shldr shldrbend shoulder",
+    "elbow": "ejc huo elbow lowerarm lowarm forearm forearmbend radius",
     "wrist": "wjc rao wrist hand",
     "toe": "bigtoe",
 }
@@ -104,7 +105,25 @@ def body_joints(names: list[str]) -> dict[str, int]:
             place = next((words.index(form) for form in spelt if form in words), None)
             if place is not None:
                 found.setdefault(side + part, place)
+    for place, name in enumerate(bare):
+        if (joint := _prefixed(name)) is not None:
+            found.setdefault(joint, place)
     return found
+
+
+_PARTS = {alias: part for part, aliases in _ALIASES.items() for alias in aliases.split()}
+_SIDES = {"l": "l", "left": "l", "r": "r", "right": "r"}
+
+
+def _prefixed(name: str) -> str | None:
+    """The joint of a rig's name with words before it: "Bip01 L Thigh", "J_Bip_L_UpperLeg", "DEF-upper_arm.L"."""
+    words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)]
+    at = next((i for i, word in enumerate(words) if word in _SIDES), None)
+    if at is None or len(words) < 2:
+        return None
+    ends = ["".join(words[at + 1 :])] if at < len(words) - 1 else ["".join(words[i:at]) for i in range(at)]
+    part = next((_PARTS[end] for end in ends if end in _PARTS), None)
+    return None if part is None else _SIDES[words[at]] + part
 
 
 def _of_subject(path: Path, points: _Points, wanted: str) -> _Points:
@@ -139,7 +158,7 @@ def _on_the_body(path: Path, points: _Points) -> tuple[np.ndarray, np.ndarray]:
         there = ", ".join(re.sub(r"[^ -~]", "?", name)[:30] for name in points.names[:20]) or "none"
         raise InputError(f"expected joints by names, found no {', '.join(missing)} among {there}; rename the joints")
     x = in_body_order(points.positions[:, list(found.values())].astype(np.float64), list(found), LIMB_JOINTS)
-    lost = (x == 0.0).all(axis=2)  # some programs write a lost point as the origin
+    lost = (x == x[..., :1]).all(axis=2)  # programs write a lost point as the origin, or as 9999999 thrice
     lost[:, [i for i in range(len(BODY_17)) if i not in _LIMBS]] = False
     x[lost | ~np.isfinite(x).all(axis=2)] = np.nan
     whole = x[np.isfinite(x[:, _LIMBS]).all(axis=(1, 2))]
@@ -218,21 +237,30 @@ def _read_c3d(path: Path) -> _Points:
 
 def _read_trc(path: Path) -> _Points:
     """Tab-separated: the labels stand in the row that begins with ``Frame#``; an empty cell is unknown."""
-    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    rows = [line.split("\t") for line in lines]
-    place = next((i for i, row in enumerate(rows[:20]) if row[0].strip().lower() == "frame#"), None)
+    text = _with_points(path)
+    rows = [re.split("\t" if "\t" in text else r" +", line) for line in text.splitlines()]
+    place = next((i for i, row in enumerate(rows[:20]) if row[0].strip().lower().rstrip("#") == "frame"), None)
     if place is None or place < 2:
         raise InputError("expected a TRC file with a row Frame#, found none; export it again")
     header = dict(zip((cell.strip().lower() for cell in rows[place - 2]), rows[place - 1], strict=False))
-    names = [name.strip() for name in rows[place][2 : 2 + 3 * _MAX_POINTS : 3]]
+    names = [name.strip() for name in rows[place][2 : 2 + 3 * _MAX_POINTS] if name.strip()]
     width = 2 + 3 * len(names)
-    data = [[_number(cell) for cell in [*row, *[""] * width][:width]] for row in rows[place + 2 :] if row[0].strip()]
+    data = [
+        [_number(cell) for cell in [*row, *[""] * width][:width]]
+        for row in rows[place + 1 :]
+        if not math.isnan(_number(row[0]))
+    ]
     table = np.array(data[: MAX_FRAMES + 1], dtype=np.float64).reshape(-1, width)
     time_s = table[:, 1]
     if not len(table) or len(table) > MAX_FRAMES or not (np.isfinite(time_s).all() and (np.diff(time_s) > 0).all()):
         raise InputError(f"expected 1 to {MAX_FRAMES} rows with a Time that increases, found others; export it again")
     unit = header.get("units", "mm").strip().lower()
     return _Points(names, table[:, 2:].reshape(len(table), -1, 3), time_s, unit if unit in _UNITS else "mm", "Y")
+
+
+def _with_points(path: Path) -> str:
+    """A text whose decimal commas are points."""
+    return re.sub(r"(?<=\d),(?=\d)", ".", path.read_text(encoding="utf-8-sig", errors="replace"))
 
 
 def _number(text: str) -> float:
@@ -253,7 +281,7 @@ class _Bone(NamedTuple):
 
 def _read_bvh(path: Path) -> _Points:
     """Forward kinematics of every joint; the format has no unit, centimetres are usual."""
-    words = iter(path.read_text(encoding="utf-8-sig", errors="replace").split())
+    words = iter(_with_points(path).split())
     try:
         bones = _hierarchy(words)
         text = list(words)  # Frames: N Frame Time: S, then the values
@@ -329,6 +357,19 @@ _READERS: tuple[tuple[re.Pattern[bytes], Callable[[Path], _Points]], ...] = (
     (re.compile(rb"\s*HIERARCHY"), _read_bvh),
     (re.compile(rb"PathFileType"), _read_trc),
 )
+
+
+def metres_of(path: Path, x: np.ndarray) -> np.ndarray:
+    """Joints (T, P, 3) of ``BODY_17``, stated to be mm with z up, in metres; a line where the body contradicts it."""
+    try:
+        unit, metres = _metres(x, "mm")
+    except InputError:  # of no unit
+        return x / 1000.0
+    if unit != "mm":
+        logger.warning("%s: taken as %s, by the size of the body", path, unit)
+    if (up := _vertical(x, "Z")) != "Z":
+        logger.warning("%s: the body stands or lies along %s, and z is taken as up; turn it if it stands", path, up)
+    return metres * x if unit != "mm" else x / 1000.0
 
 
 def load_mocap(

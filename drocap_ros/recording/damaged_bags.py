@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.recording.mcap.metadata import standard_types, types_of
-from drocap_ros.recording.session import Message, RawMessage, Session, SessionInfo
+from drocap_ros.recording.session import Message, RawMessage, Session, SessionInfo, unpacked
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -127,9 +127,9 @@ def _is_header(data: bytes, at: int) -> bool:
 
 
 class SqliteScan(Session):
-    """Reads a damaged ``.db3`` row by row; rows that cannot be read are left out with a warning."""
+    """Reads ``.db3`` files row by row, with their journals; rows that cannot be read are left out with a warning."""
 
-    def __init__(self, path: Path, files: list[Path]) -> None:
+    def __init__(self, path: Path, files: list[Path], why: str = "") -> None:
         super().__init__(path)
         self._files = files
         self._stores: dict[tuple[str, str], Typestore] = {}
@@ -137,14 +137,13 @@ class SqliteScan(Session):
             raise InputError(
                 f"{path}: expected a rosbag2 recording with messages, found none that can be read; check it"
             )
-        self.warn("the recording is damaged: read row by row, those about the damage are missing")
+        self.warn(why or "the recording is damaged: read row by row, those about the damage are missing")
 
     def raw_messages(self, topics: Collection[str] = ()) -> Iterator[RawMessage]:
         """Messages of some topics (default: all) in the order of the files."""
         for file in self._files:
-            with contextlib.closing(
-                sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
-            ) as base:
+            how = "mode=ro" if journal_of(file) else "mode=ro&immutable=1"
+            with contextlib.closing(sqlite3.connect(f"{file.absolute().as_uri()}?{how}", uri=True)) as base:
                 known = {row[0]: (row[1], row[2]) for row in _rows_of(base, "SELECT id, name, type FROM topics")}
                 texts = dict(_rows_of(base, "SELECT topic_type, encoded_message_definition FROM message_definitions"))
                 last, most = next(_rows_of(base, "SELECT max(id) FROM messages"), (None,))[0], file.stat().st_size
@@ -161,7 +160,7 @@ class SqliteScan(Session):
                     for topic_id, log_time_ns, data in found or ():
                         name, kind = known.get(topic_id, ("", ""))
                         if name and isinstance(data, bytes) and (not topics or name in topics):
-                            yield RawMessage(name, kind, int(log_time_ns), data, texts.get(kind, ""))
+                            yield RawMessage(name, kind, int(log_time_ns), unpacked(data), texts.get(kind, ""))
 
     def decode(self, raw: RawMessage) -> Message:
         """The message as an object with the fields of its definition."""
@@ -172,6 +171,12 @@ class SqliteScan(Session):
 
     def _read_info(self) -> SessionInfo:
         return self._counted("rosbag2, SQLite")
+
+
+def journal_of(file: Path) -> bool:
+    """Whether messages of a ``.db3`` are still in the journal beside it, as after a crash of the recorder."""
+    journal = file.with_name(f"{file.name}-wal")
+    return journal.is_file() and journal.stat().st_size > 0
 
 
 def _rows_of(base: sqlite3.Connection, words: str) -> Iterator[tuple[Any, ...]]:

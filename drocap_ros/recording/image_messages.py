@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import re
+import math
 from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.sources.image_files import colour_rank, decoded, raw_to_bgr
+from drocap_ros.perception.sources.image_files import NO_PICTURE, colour_rank, decoded, raw_to_bgr
 from drocap_ros.perception.sources.video import codec_of, decoded_packets
 from drocap_ros.recording.session import IMAGES, Message, Session, TopicInfo, header_stamp_ns
 from drocap_ros.stamps import CONFIRMED_AFTER, NS
@@ -19,8 +19,6 @@ from drocap_ros.stamps import CONFIRMED_AFTER, NS
 if TYPE_CHECKING:
     from drocap_ros.perception.sources.base import Frame
 
-#: A topic of this name holds no pictures of a camera.
-_NO_PICTURE = re.compile(r"depth|disparity|mask|label|segment|confidence", re.IGNORECASE)
 #: Rank of a topic of distances or labels, behind colour (0) and grey (1).
 _DEPTH_RANK = 2
 #: Least step of stamps against the recorder's times that is one of the clock, and no jitter.
@@ -54,22 +52,27 @@ def choose_images(session: Session, wanted: str = "") -> TopicInfo:
         raise InputError(f"{session.path}: expected a topic with images, found {there}; record one")
     if len(found) < 2:
         return found[0]
-    by_rank: dict[int, list[TopicInfo]] = {}
-    for topic in found:
-        by_rank.setdefault(_rank(session, topic), []).append(topic)
-    least, best = min(by_rank.items())
+    ranks = {topic: _rank(session, topic) for topic in found}
+    least = min(rank for rank, _ in ranks.values())
+    best = [topic for topic in found if ranks[topic][0] == least]
+    # A small picture is a preview of the large one, of which few images are no recording.
+    chosen = max(best, key=lambda topic: (2 * topic.count > best[0].count, ranks[topic][1]))
     if least == _DEPTH_RANK:
         raise InputError(f"{session.path}: expected colour or grey images, found {names}; choose one with --topic NAME")
     if len(best) > 1:
-        session.warn(f"several topics of images: {names}; took {best[0].name}, --topic NAME chooses another")
-    return best[0]
+        session.warn(f"several topics of images: {names}; took {chosen.name}, --topic NAME chooses another")
+    return chosen
 
 
-def _rank(session: Session, topic: TopicInfo) -> int:
-    """0 for colour, 1 for grey, 2 for distances and labels, by the first message."""
+def _rank(session: Session, topic: TopicInfo) -> tuple[int, float]:
+    """0 for colour, 1 for grey, 2 for distances and labels, and the area, by the first message; infinity of a video."""
     first = next((message for _, message in session.messages((topic.name,))), None)
     form = str(getattr(first, "encoding", getattr(first, "format", "")))
-    return _DEPTH_RANK if first is None or _NO_PICTURE.search(topic.name) else colour_rank(form)
+    rank = _DEPTH_RANK if first is None or NO_PICTURE.search(topic.name) else colour_rank(form)
+    try:
+        return rank, float(np.prod(image_from_message(first).shape[:2]))
+    except (InputError, AttributeError, ValueError):  # a packet of a video, or damage
+        return rank, math.inf if codec_of(form) else 0.0
 
 
 def read_images(session: Session, topic: str = "") -> Iterator[Frame]:
@@ -100,6 +103,9 @@ def read_images(session: Session, topic: str = "") -> Iterator[Frame]:
         session.warn(f"{problems.total()} images on {chosen.name} were left out: {worst}")
         if last_ns is None:
             raise InputError(f"{session.path}: {chosen.name}: {worst}")
+    if last_ns is None:
+        raise InputError(f"{session.path}: {chosen.name}: expected images, found {chosen.count} messages of"
+                         f" {chosen.type_name} that cannot be decoded; record them with their definition")  # fmt: skip
 
 
 def _images(session: Session, chosen: TopicInfo, problems: Counter[str]) -> Iterator[tuple[int, Message | np.ndarray]]:

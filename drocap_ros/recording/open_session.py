@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.file_kind import RECORDINGS, FileKind, file_kind, unpacking
-from drocap_ros.recording.damaged_bags import BagScan, SqliteScan
+from drocap_ros.recording.damaged_bags import BagScan, SqliteScan, journal_of
 from drocap_ros.recording.mcap.metadata import METADATA_FILE, custom_metadata, read_metadata, storage_files, types_of
-from drocap_ros.recording.session import FORMS, Message, RawMessage, Session, SessionInfo
+from drocap_ros.recording.session import FORMS, Message, RawMessage, Session, SessionInfo, unpacked
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -22,16 +22,30 @@ import struct
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from drocap_ros.recording.mcap.metadata import METADATA_RECORD, FileRecord, standard_types
 from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, counted_channels
 from drocap_ros.recording.telemetry.djmd_layouts import Value, read_message
 
-_TEXT = ("format", "encoding", "frame_id")
+_TEXT = ("format", "encoding", "frame_id", "distortion_model")
 _COUNTS = ("width", "height", "step")
+_ROWS = ("D", "K", "R", "P")
 _FIELDS: dict[str, dict[str, int]] = {
     "foxglove.CompressedImage": {"timestamp": 1, "data": 2, "format": 3, "frame_id": 4},
     "foxglove.CompressedVideo": {"timestamp": 1, "frame_id": 2, "data": 3, "format": 4},
     "foxglove.RawImage": {"timestamp": 1, "width": 2, "height": 3, "encoding": 4, "step": 5, "data": 6, "frame_id": 7},
+    "foxglove.CameraCalibration": {
+        "timestamp": 1,
+        "width": 2,
+        "height": 3,
+        "distortion_model": 4,
+        "D": 5,
+        "K": 6,
+        "R": 7,
+        "P": 8,
+        "frame_id": 9,
+    },
 }
 _LATEST_S = 2**63 // 10**9  # s: ns must fit into 64 bits with a sign
 
@@ -45,7 +59,7 @@ def foxglove_message(data: bytes, encoding: str, type_name: str) -> SimpleNamesp
     if encoding == "json":
         found = json.loads(data)
         time = found.get("timestamp", {})
-        values = {name: found.get(name, "" if name in _TEXT else 0) for name in numbers}
+        values = {name: found.get(name, "" if name in _TEXT else [] if name in _ROWS else 0) for name in numbers}
         values["data"] = base64.b64decode(found.get("data", ""), validate=True)
         time = {1: time.get("sec", 0), 2: time.get("nsec", 0)}
     else:
@@ -57,14 +71,16 @@ def foxglove_message(data: bytes, encoding: str, type_name: str) -> SimpleNamesp
     if not 0 <= sec < _LATEST_S:
         raise InputError(f"timestamp: expected a time after 1970, got {sec} s")
     values["timestamp"] = SimpleNamespace(sec=sec, nanosec=nanosec)
-    kinds = {**dict.fromkeys(_TEXT, str), **dict.fromkeys(_COUNTS, int)}
+    kinds = {**dict.fromkeys(_TEXT, str), **dict.fromkeys(_COUNTS, int), **dict.fromkeys(_ROWS, np.float64)}
     return SimpleNamespace(**{name: kinds.get(name, lambda v: v)(value) for name, value in values.items()})
 
 
-def _of_protobuf(name: str, value: Value | None) -> Value | str:
+def _of_protobuf(name: str, value: Value | None) -> Value | str | np.ndarray:
     """A field; proto3 leaves out zeros and empty ones."""
+    content = value if isinstance(value, bytes) else b""
+    if name in _ROWS:
+        return np.frombuffer(content, "<f8")
     if name == "data" or name in _TEXT:
-        content = value if isinstance(value, bytes) else b""
         return content.decode("utf-8", "replace") if name in _TEXT else content
     # The reader takes 32 fixed bits for a float; these are an integer.
     return struct.unpack("<I", struct.pack("<f", value))[0] if isinstance(value, float) else 0
@@ -96,7 +112,9 @@ class McapSession(Session):
                 count += 1
                 channel = message.channel
                 if not topics or channel.topic in topics:
-                    yield RawMessage(channel.topic, channel.type_name, message.log_time_ns, message.data, channel)
+                    yield RawMessage(
+                        channel.topic, channel.type_name, message.log_time_ns, unpacked(message.data), channel
+                    )
             self._warn_of_damage(stream, count)
 
     def decode(self, raw: RawMessage) -> Message:
@@ -185,7 +203,7 @@ class RosbagsSession(Session):
                 messages = self._reader.messages(connections, start=begin_ns)
                 continue
             begin_ns, skip_ns = log_time_ns, _SKIP_NS
-            yield RawMessage(connection.topic, connection.msgtype, log_time_ns, bytes(data), connection)
+            yield RawMessage(connection.topic, connection.msgtype, log_time_ns, unpacked(bytes(data)), connection)
 
     def decode(self, raw: RawMessage) -> Message:
         """The message as an object with the fields of its definition."""
@@ -214,15 +232,20 @@ _PACKED = ".zstd"
 
 def is_recording(path: str | Path) -> bool:
     """Whether :func:`open_session` may read a path: by its first bytes, its name, or the names in a folder."""
-    path = Path(path)
+    path = _folder_of(Path(path))
     if path.is_dir():
         return (path / METADATA_FILE).is_file() or any(p.suffix in (*_SUFFIXES, _PACKED) for p in path.glob("[!.]*"))
     return path.suffix in _SUFFIXES or (path.is_file() and file_kind(path) in RECORDINGS)
 
 
+def _folder_of(path: Path) -> Path:
+    """The recording itself, of its description in the folder the folder."""
+    return path.parent if path.name == METADATA_FILE and path.is_file() else path
+
+
 def open_session(path: str | Path) -> Session:
     """Open a recording."""
-    path = Path(path)
+    path = _folder_of(Path(path))
     if not path.exists():
         raise InputError(f"{path}: expected {FORMS}, found no such file; check the path")
     if not (path.is_file() or path.is_dir()):
@@ -256,14 +279,16 @@ def session_info(path: str | Path) -> SessionInfo:
 
 
 def _open_bag(path: Path) -> Session:
+    bases = sorted(path.glob("[!.]*.db3")) if path.is_dir() else [path] * (file_kind(path) is FileKind.SQLITE)
     try:
+        if any(map(journal_of, bases)):  # the library reads none
+            return SqliteScan(path, bases, "its journal holds messages, as after a crash: read row by row")
         return RosbagsSession(path)
     except InputError:
-        if path.is_dir() or file_kind(path) is FileKind.SQLITE:
-            files = sorted(path.glob("[!.]*.db3")) if path.is_dir() else [path]
-            if not files:
-                raise
-            return SqliteScan(path, files)
+        if bases:
+            return SqliteScan(path, bases)
+        if path.is_dir():
+            raise
         if file_kind(path) is not FileKind.ROSBAG1:
             raise
         return BagScan(path)
@@ -272,12 +297,11 @@ def _open_bag(path: Path) -> Session:
 def _open_folder(path: Path) -> Session:
     description, warnings = read_metadata(path)
     storage = description.get("storage_identifier", "")
-    packed = str(description.get("compression_mode", "")).lower() not in ("", "none")
     files = storage_files(path, description)
     if not description and not any(p.suffix in _SUFFIXES for p in path.glob("[!.]*")):
         raise InputError(f"{path}: expected a usable {METADATA_FILE} of compressed files, found none; unpack: zstd -d")
     session: Session
-    if files and storage in ("mcap", "") and not packed and all(f.suffix == ".mcap" for f in files):
+    if files and storage in ("mcap", "") and all(f.suffix == ".mcap" for f in files):
         session = McapSession(path, files, custom_metadata(description))
     else:
         session = _open_bag(path)

@@ -75,12 +75,20 @@ _Row = tuple[np.ndarray, np.ndarray, bool]
 
 
 def _rows(session: Session, topic: TopicInfo, read: Callable[[Message], _Row]) -> dict[int, _Row]:
-    return {header_stamp_ns(message): read(message) for _, message in session.messages((topic.name,))}
+    """Rows by their stamps, or by the recorder's times where the stamps do not advance."""
+    found = [
+        (header_stamp_ns(message), raw.log_time_ns, read(message)) for raw, message in session.messages((topic.name,))
+    ]
+    at = int(len({stamp_ns for stamp_ns, _, _ in found}) < len(found) / 2)
+    if at:
+        session.warn(f"the stamps on {topic.name} do not advance: the recorder's times are used, late by the transport")
+    return {times[at]: row for *times, row in found}
 
 
 def _attitude(message: Message) -> _Row:
     turn = message.orientation if hasattr(message, "orientation") else message.quaternion
-    return np.full(3, np.nan), xyzw_of(turn), False
+    unknown = np.ravel(getattr(message, "orientation_covariance", 0.0))[0] == -1  # as sensor_msgs/Imu says
+    return np.full(3, np.nan), np.full(4, np.nan) if unknown else xyzw_of(turn), False
 
 
 def _pose(message: Message) -> _Row:

@@ -97,9 +97,14 @@ def add_calibration(history: CameraHistory, message: Message) -> None:
         raise InputError(unknown)
 
 
+#: Names of lenses that others write.
+_LENS_NAMES = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant", "kannala_brandt": "equidistant"}
+
+
 def lens_of(message: Message) -> tuple[CameraModel | None, str]:
     """The lens of a ``CameraInfo``, None where it holds no matrix; and in words what of it has no known form."""
     matrix, found, model = numbers_of(message, "k"), numbers_of(message, "d"), str(message.distortion_model)
+    model = _LENS_NAMES.get(model.lower(), model)
     if matrix.size != 9:
         return None, ""
     lens = CameraModel(int(message.width), int(message.height), matrix.reshape(3, 3))

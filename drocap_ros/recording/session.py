@@ -22,6 +22,8 @@ POSE3D = "drocap_ros/msg/Pose3D"
 POSE3D_WINDOW = "drocap_ros/msg/Pose3DWindow"
 VEHICLE_STATE = "drocap_ros/msg/VehicleState"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+#: Types of calibrations.
+CALIBRATIONS = (CAMERA_INFO, "foxglove_msgs/msg/CameraCalibration", "foxglove.CameraCalibration")
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 #: Types of images and of packets of a video.
@@ -31,6 +33,8 @@ IMAGES = (
     *(f"{package}{kind}" for package in ("foxglove_msgs/msg/", "foxglove.") for kind in _FOXGLOVE),
 )
 
+#: Bytes of a message: an image of 8000x6000 px and more; a longer one is damage.
+_MAX_MESSAGE = 1 << 29
 #: Forms of a recording, for messages.
 FORMS = "a session folder, .mcap, .bag, .db3 or rosbag2 folder"
 
@@ -127,16 +131,18 @@ class Session(ABC):
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[RawMessage, Message]]:
         """Decoded messages of some topics; messages that cannot be decoded are left out with a warning."""
-        failed = 0
+        failed = Counter[str]()
         for raw in self.raw_messages(topics):
             try:
                 message = self.decode(raw)
             except Exception:  # noqa: BLE001  # a damaged message fails in many ways
-                failed += 1
+                failed[raw.type_name] += 1
                 continue
             yield raw, message
         if failed:
-            self.warn(f"{failed} messages could not be decoded and were left out")
+            kinds = ", ".join(failed)
+            self.warn(f"{failed.total()} messages could not be decoded and were left out ({kinds}; damaged, or the"
+                      " recording lacks their definition)")  # fmt: skip
 
     def warn(self, text: str) -> None:
         """Add a warning, once."""
@@ -172,6 +178,17 @@ class Session(ABC):
     def close(self) -> None:
         """Release the files, where they stay open between readings."""
         return
+
+
+def unpacked(data: bytes) -> bytes:
+    """A message, which a recorder may have compressed alone: zstd's first bytes are those of no message."""
+    if data[:4] != b"\x28\xb5\x2f\xfd":
+        return data
+    import zstandard
+
+    if zstandard.get_frame_parameters(data).content_size > _MAX_MESSAGE:
+        return data
+    return zstandard.ZstdDecompressor().decompress(data, max_output_size=_MAX_MESSAGE)
 
 
 def header_stamp_ns(message: Message) -> int:

@@ -166,7 +166,7 @@ def _tracks_of(stamp_ns: np.ndarray, messages: list[Message], track_id: int) -> 
 
 def _recorded_lens(session: Session, near: str, size: tuple[int, int]) -> CameraModel | None:
     """The lens of the first usable camera info, for images of ``size`` (width, height) px; or None."""
-    info = _nearest(session.topics_of(recorded.CAMERA_INFO), near)
+    info = _nearest(session.topics_of(*recorded.CALIBRATIONS), near)
     if info is None:
         return None
     camera = _first_calibration(session, info.name, size, rectified=bool(_RECTIFIED.search(near.rpartition("/")[2])))
@@ -206,8 +206,8 @@ def _first_calibration(session: Session, topic: str, size: tuple[int, int], *, r
                 session.warn(f"{topic}: {unknown}")
             if distortion.any():
                 session.warn(f"the distortion of the lens on {topic} is taken off the keypoints")
-            part = message.roi
-            if (part.width, part.height) == size != (camera.width, camera.height):
+            part = getattr(message, "roi", None)  # Foxglove's has none
+            if part is not None and (part.width, part.height) == size != (camera.width, camera.height):
                 moved = camera.matrix - [[0, 0, part.x_offset], [0, 0, part.y_offset], [0, 0, 0]]
                 camera = dataclasses.replace(camera, width=part.width, height=part.height, matrix=moved)
             first = matrix

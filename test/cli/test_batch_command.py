@@ -215,7 +215,8 @@ def folder(tmp_path, monkeypatch):
         "season/a.npz", "season/DJI_1.MP4", "season/photo.jpg", "season/DJI_1.SRT", "season/.hidden.mp4",
         "season/flight/metadata.yaml", "season/flight/flight_0.mcap", "season/loose/one.mcap", "season/loose/two.mcap",
         "season/images/1.png", "season/images/2.png", "season/done/motion.npz", "season/done/tracks.npz",
-        "season/done/report.html", "season/empty/notes.md", "with space.npz",
+        "season/done/report.html", "season/empty/notes.md", "with space.npz", "season/@eaDir/a.mp4/SYNO_THUMB.jpg",
+        "season/__MACOSX/b.mp4",
     ):  # fmt: skip
         path = Path(name)
         path.parent.mkdir(parents=True, exist_ok=True)

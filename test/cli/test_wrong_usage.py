@@ -1,10 +1,15 @@
 """Wrong usage: one line that says what was found and what to do, status 2, nothing written."""
 
+import os
+
 import numpy as np
 import pytest
+from orders_of_points import in_order, views
 from refusals import refused
 
+from drocap_ros.motion import save_motion
 from drocap_ros.skeleton import COCO_17
+from drocap_ros.tracks import Tracks, save_tracks
 
 FILES = {
     "notes.txt": b"a man walks\n" * 30, "skier.jpg": b"\xff\xd8\xff\xe0" + bytes(300), "empty.mp4": b"",
@@ -87,3 +92,86 @@ def folder(tmp_path):
 def test_wrong_usage_is_one_line_and_status_2(folder, capsys, monkeypatch, words, said):
     monkeypatch.chdir(folder)
     refused(words.split(), folder, capsys, said)
+
+
+@pytest.fixture
+def results(folder, walker):
+    """A motion in ``m``, tracks of a body, and names that need care."""
+    (folder / "m").mkdir()
+    save_motion(folder / "m" / "motion.npz", walker)
+    body = in_order(views(seconds=1.0)[2], "coco17", np.random.default_rng(0))
+    tracks = Tracks(body, COCO_17.joints, np.arange(len(body)) * 33_333_333, (1280, 720))
+    for name in ("body.npz", "-dash.npz", "wälk ünï.npz"):
+        save_tracks(folder / name, tracks)
+    (folder / "loop").symlink_to("loop")
+    os.mkfifo(folder / "pipe")
+    return folder
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    ("info loop", "found no such file"), ("info pipe", "found a pipe or device"), ("info notes.txt/x", "found no such"),
+    ("info body.npz --metadata", "expected a motion, found 2D tracks"), ("info nothing --metadata", "without one"),
+    ("info -x", "SESSION"), ("info m body.npz", "unrecognized arguments: body.npz"),
+    ("track clip.mp4 --threads 0", "expected 1 to 256"), ("track clip.mp4 --threads 1.5", "expected 1 to 256"),
+    ("track clip.mp4 --start nan", "--start nan"), ("track clip.mp4 --end -2", "--end -2"),
+    ("track clip.mp4 --start inf --models nowhere", "--start inf"), ("track clip.mp4 --subject middle", "got 'middle'"),
+    ("track clip.mp4 --subject nan,0,1,1", "expected x_min,y_min,x_max,y_max"),
+    ("track clip.mp4 --points", "--overlay"),
+    ("track clip.mp4 --list --all", "leave it out"), ("track m", "found the folder of a motion"),
+    ("track m/motion.npz --models simulation", "drocap info m/motion.npz"),
+    ("track clip.mp4 --out notes.txt", "found a file"), ("track clip.mp4 --out notes.txt/x", "expected a writable"),
+    ("track clip.mp4 --config lens.yaml", "unknown component 'a'"), ("track clip.mp4 --config nowhere.yaml", "No such"),
+    ("reconstruct", "required: INPUT; see"), ("reconstruct -dash.npz", "is named ./-dash.npz"),
+    ("reconstruct s3://bucket/a.mp4", "s3://bucket/a.mp4: expected"), ("reconstruct http://", "expected"),
+    ("reconstruct body.npz --height 1,80", "--height"), ("reconstruct body.npz --height nan", "expected 0.5 to 2.5"),
+    ("reconstruct body.npz --fov nan", "expected 5 to"), ("reconstruct body.npz --focal inf", "expected 10 to"),
+    ("reconstruct body.npz --fov 60 --focal 900", "not allowed with"), ("reconstruct body.npz --rate nan", "--rate"),
+    ("reconstruct body.npz --calibration nothing", "Is a directory"),
+    ("reconstruct body.npz --image-size 0x0", "1920x"),
+    ("reconstruct body.npz --dictionary nowhere.npz", "expected a pose dictionary, found no file"),
+    ("reconstruct body.npz --redetect", "expected a recording with images"), ("reconstruct body.npz --all", "several"),
+    ("reconstruct body.npz --evidence nothing", "expected a readable .npz"),
+    ("reconstruct m/motion.npz", "found a motion"),
+    ("reconstruct body.npz --corrections skier.jpg", "expected YAML"), ("reconstruct body.npz --start 100", "within"),
+    ("reconstruct body.npz --camera-pitch nan", "-90 to 90"),
+    ("reconstruct body.npz --level --camera-roll 4", "neither"),
+    ("reconstruct body.npz --mount-pitch 5", "expected --telemetry"), ("reconstruct body.npz --method live", "pose2d"),
+    ("reconstruct body.npz --out /proc/x", "cannot be written"), ("reconstruct body.npz --threads many", "1 to 256"),
+    ("reconstruct body.npz body.npz --together", "the same one twice"),
+    ("reconstruct a.jpg b.jpg", "name their folder"),
+    ("export m", "--to"),
+    ("export m --to BVH", "invalid choice"), ("export m --to bvh --out nothing", "found a folder"),
+    ("export m --to bvh --out m/motion.npz", "own input"), ("export m --to bvh --out x.fbx", "ends in .bvh"),
+    ("export m --to csv --names mixamo", "leave it out"), ("export m --to bvh --smooth nan", "cut-off"),
+    ("export m --to bvh --smooth -3", "cut-off"), ("export nothing --to bvh", "drocap reconstruct nothing"),
+    ("evaluate compare m", "TRUTH"), ("evaluate compare m nothing", "no such file"),
+    ("evaluate compare m m --time-offset soon", "expected seconds or find"),
+    ("evaluate compare m m --time-offset nan", "expected seconds or find"), ("evaluate table nothing", "found none"),
+    ("evaluate compare m m --time-offset 1e9", "within the truth's time"),
+    ("evaluate table notes.txt", "no such folder"),
+    ("report m --video skier.jpg", "do not decode"), ("report m --out nothing", "found a folder"),
+    ("view nothing", "name the folder of a motion"), ("recover nothing", "found none or others"),
+    ("batch body.npz --out out --jobs 0", "at least 1"), ("batch body.npz --out notes.txt", "found a file"),
+    ("batch body.npz --out out --height 17", "expected 0.5 to 2.5"), ("batch nothing --out out", "found none"),
+    ("batch body.npz --out out --start -1", "--start -1"), ("batch body.npz --out out --camera-pitch 91", "-90 to 90"),
+    ("batch body.npz --out out --fov 0 --end 3", "expected 5 to"), ("batch notes.txt --out out", "notes.txt:1"),
+    ("models list --models nowhere", "found no such folder"), ("models fetch nosuch", "expected one of"),
+    ("calibrate nothing", "found none"), ("demo --seconds nan", "expected 2 to"),
+    ("demo --seed -1", "expected an integer"),
+    ("live", "expected --config or --source"), ("live --config skier.jpg", "expected YAML"),
+    ("app notes.txt", "a folder"),
+    ("top --namespace 9x", "expected names of letters"), ("nosuch", "invalid choice"), ("--completion tcsh", "tcsh"),
+])  # fmt: skip
+def test_more_wrong_usage_is_one_line_and_status_2(results, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(results)
+    refused(words.split(), results, capsys, said)
+
+
+@pytest.mark.parametrize("words", [
+    ["info", "wälk.npz"], ["info", "a name\nof two lines"], ["reconstruct", "wälk ünï.npz", "--height", "9,0"],
+    ["reconstruct", ""], ["export", "m", "--to", "bvh", "--out", ""], ["reconstruct", "body.npz", "--out="],
+    ["track", "wälk ünï.npz"], ["evaluate", "compare", "m", "wälk ünï.npz"], ["batch", "wälk*.mp4", "--out", "out dir"],
+])  # fmt: skip
+def test_names_of_any_letters_are_refused_in_one_line(results, capsys, monkeypatch, words):
+    monkeypatch.chdir(results)
+    refused(words, results, capsys, "")

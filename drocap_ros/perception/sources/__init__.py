@@ -15,7 +15,7 @@ from drocap_ros.perception.sources.base import (
     SourceEventKind,
     prefetch,
 )
-from drocap_ros.perception.sources.image_files import ImageFileSource
+from drocap_ros.perception.sources.image_files import ImageFileSource, is_mjpeg
 from drocap_ros.perception.sources.live_source import open_camera, open_stream
 from drocap_ros.perception.sources.video import VideoSource
 
@@ -47,6 +47,6 @@ def _open_path(text: str, config: ImageIngestConfig, track: str) -> ImageSource:
         )
     if path.is_fifo() or path.suffix.lower() == ".sdp":
         return open_stream(str(path), config)
-    if path.is_dir() or file_kind(path) is FileKind.IMAGE:
+    if path.is_dir() or (file_kind(path) is FileKind.IMAGE and not is_mjpeg(path)):
         return ImageFileSource(path, config.folder_rate_hz)
     return VideoSource(path, track)

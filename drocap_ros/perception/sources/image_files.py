@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import math
 import os
 import re
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +17,8 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
 
 logger = logging.getLogger(__name__)
+
+Image = TypeVar("Image")
 
 # The header of a small file can declare an image of gigabytes.  OpenCV reads this limit when it is imported.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
@@ -45,7 +50,8 @@ _PACKED = dict.fromkeys(("yuv422", "uyvy"), "COLOR_YUV2BGR_UYVY")
 _PACKED |= dict.fromkeys(("yuv422_yuy2", "yuyv", "yuy2"), "COLOR_YUV2BGR_YUYV")
 #: Luma, then chroma of half the rows.
 _PLANAR = {"nv12": "NV12", "nv21": "NV21", "i420": "I420", "yuv420": "I420", "yuv420p": "I420", "yv12": "YV12"}
-_NAMED = re.compile(r"(bgra?|rgba?|mono|bayer_[rgb]{4})_?(8|10|12|14|16)")
+_NAMED = re.compile(r"(bgra?|rgba?|mono|gr[ae]y|y|bayer_[rgb]{4})_?(8|10|12|14|16)?")
+_GREYS = dict.fromkeys(("gray", "grey", "y"), "mono")
 _TYPED = re.compile(r"(8U|16U|32F)C([134])")
 _DEPTH = re.compile(r"16[US]C1|32FC1|64FC1|.*compressedDepth.*")
 _GREY = re.compile(r"mono|8UC1")
@@ -91,7 +97,10 @@ def decoded(data: np.ndarray, form: str) -> np.ndarray:
         image = None
     if image is None:
         raise InputError(f"image: expected JPEG, PNG or another image, got format {form[:40]!r} that does not decode")
-    return to_bgr(np.asarray(image))
+    pixels, named = to_bgr(np.asarray(image)), _NAMED.match(form.strip().lower())
+    if named and named[1].startswith("bayer") and (pixels[..., :1] == pixels).all():  # a sensor's mosaic as grey
+        return np.asarray(cv2.cvtColor(pixels[..., 0], getattr(cv2, str(_ORDERS[named[1]][1]))))
+    return pixels
 
 
 def raw_to_bgr(data: np.ndarray, size: tuple[int, int], step: int, encoding: str, big_endian: bool) -> np.ndarray:
@@ -116,6 +125,7 @@ def raw_to_bgr(data: np.ndarray, size: tuple[int, int], step: int, encoding: str
 def _rows(data: np.ndarray, shape: tuple[int, int], step: int, words: str) -> np.ndarray:
     """(rows, bytes) of data whose rows are ``step`` bytes apart."""
     rows, width = shape
+    step = step or width  # as some drivers leave it
     if not 0 < rows * width <= _MAX_PIXELS * 16 or step < width or data.size < rows * step:
         raise InputError(f"image: expected {rows} rows of {step} bytes for {words}, got {data.size} bytes")
     return data[: rows * step].reshape(rows, step)[:, :width]
@@ -150,8 +160,8 @@ def _layout(encoding: str) -> tuple[int, str | None, np.dtype]:
         return 2, _PACKED[encoding.lower()], np.dtype("u1")
     if typed := _TYPED.fullmatch(encoding):
         order, kind = _OF_CHANNELS[typed[2]], {"8U": "u1", "16U": "u2", "32F": "f4"}[typed[1]]
-    elif (named := _NAMED.fullmatch(encoding)) and named[1] in _ORDERS:
-        order, kind = named[1], "u1" if named[2] == "8" else "u2"
+    elif (named := _NAMED.fullmatch(encoding.strip().lower())) and (order := _GREYS.get(named[1], named[1])) in _ORDERS:
+        kind = "u1" if named[2] in (None, "8") else "u2"
     else:
         known = (*(f"{name}8 or 16" for name in _ORDERS), *_PACKED, *_PLANAR, "8UC3 and the like")
         raise InputError(f"image: expected encoding {', '.join(known)}, got {encoding[:40]!r}; convert it")
@@ -160,8 +170,12 @@ def _layout(encoding: str) -> tuple[int, str | None, np.dtype]:
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 
-#: Least number of digits of a file name that is a time in nanoseconds (the EuRoC and TUM convention).
-_STAMP_DIGITS = 16
+#: A time at the end of a name: seconds with their fraction (TUM), or ms, us or ns as one number (EuRoC, Kalibr).
+_TIME = re.compile(r"(?:^|\D)(?:(\d{9,10})(?:\.(\d{3,9})|_(\d{9}))|(\d{13,19}))$")
+#: A name's begin, number and end.
+_NUMBERED = re.compile(r"(.*?)(\d*)(\D*)")
+#: Names of what is no picture of a camera.
+NO_PICTURE = re.compile(r"depth|disparity|mask|label|segment|confidence", re.IGNORECASE)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -193,28 +207,38 @@ def encode_jpeg(image: np.ndarray, quality: int = 90) -> bytes:
     return data.tobytes()
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
+def natural(name: object) -> list[tuple[int, int, str]]:
     """Sort key that puts frame_2 before frame_10."""
-    return [(1, int(t), "") if t.isdigit() else (0, 0, t) for t in re.split(r"(\d+)", name) if t]
+    return [(1, int(t), "") if t.isdigit() else (0, 0, t) for t in re.split(r"(\d+)", str(name)) if t]
 
 
 class ImageFileSource(ImageSource):
     """Image files of one size.
 
-    Stamps are the file names where these are times in nanoseconds, else ``rate_hz`` counts from 0.  Files of a folder
-    that do not decode are gaps, and a ``DAMAGED`` event follows at the end.
+    Stamps are the times in the files' names, else ``rate_hz`` and their numbers count from 0.  Files of a folder that
+    do not decode are gaps, and a ``DAMAGED`` event follows at the end.
     """
 
     def __init__(self, path: Path, rate_hz: float = 30.0) -> None:
         super().__init__()
         if path.is_dir():
-            self._paths = sorted(
-                (p for p in path.glob("[!.]*") if p.suffix.lower() in SUFFIXES and p.is_file()),
-                key=lambda p: _natural(p.name),
-            )
+            there = sorted(path.glob("[!.]*"), key=lambda p: natural(p.name))
+            images = [p for p in there if p.suffix.lower() in SUFFIXES and p.is_file()]
+            self._paths, words = of_one_recording(images, [p.name for p in images])
+            if words:
+                logger.warning("%s: %s", path, words)
             if not self._paths:
-                raise InputError(f"{path}: expected a folder with images ({', '.join(sorted(SUFFIXES))}), found none")
+                found = ", ".join(dict.fromkeys(p.suffix or f"{p.name}/" for p in there)) or "none"
+                raise InputError(
+                    f"{path}: expected a folder with images ({', '.join(sorted(SUFFIXES))}), found {found}; name one of"
+                    " its videos or folders, or convert its files"
+                )
         else:
+            if _pictures_in(path) > 1:
+                raise InputError(
+                    f"{path}: expected one picture, found {_pictures_in(path)} in one file; convert it: ffmpeg -i IN"
+                    " OUT.mp4, or the pages to files of a folder"
+                )
             self._paths = [path]
         self._stamps = _stamps(self._paths, rate_hz)
         self._next, self._damaged = 0, list[Path]()
@@ -265,9 +289,51 @@ class ImageFileSource(ImageSource):
 
 
 def _stamps(paths: list[Path], rate_hz: float) -> list[int]:
-    stems = [p.stem for p in paths]
-    if all(s.isdigit() and len(s) >= _STAMP_DIGITS for s in stems):
-        stamps = [int(s) for s in stems]
-        if all(b > a for a, b in pairwise(stamps)):
-            return stamps
+    """Times of the images, ns: those in their names, else their numbers, in even steps, by the rate."""
+    found = [match.groups() for p in paths if (match := _TIME.search(p.stem))]
+    times = [int(whole) if whole else int(s + (fraction or ns).ljust(9, "0")) for s, fraction, ns, whole in found]
+    if len(times) == len(paths) > 1 and all(b > a for a, b in pairwise(times)):
+        step = float(np.median(np.diff(times)))
+        for unit_ns in (1, 10**3, 10**6):
+            if 1e6 <= step * unit_ns <= 1e10:  # of a camera
+                return [time * unit_ns for time in times]
+    numbers = [int(number) for p in paths if (number := _NUMBERED.fullmatch(p.stem.lower())[2])]  # type: ignore[index]
+    steps = [b - a for a, b in pairwise(numbers)]
+    # Of frames' numbers most follow each other.
+    if len(numbers) == len(paths) > 1 and min(steps) > 0 and 2 * steps.count(least := math.gcd(*steps)) > len(steps):
+        return [round((number - numbers[0]) // least * 1e9 / rate_hz) for number in numbers]
     return [round(i * 1e9 / rate_hz) for i in range(len(paths))]
+
+
+def of_one_recording(images: list[Image], names: list[str]) -> tuple[list[Image], str]:
+    """The images of the recording with most of them, and words on others, where names differ not by a number alone.
+
+    Such are two cameras, masks or depths beside the pictures, or each picture in two formats.
+    """
+    kinds: dict[tuple[str, str], list[Image]] = {}
+    for image, name in zip(images, names, strict=True):
+        begin, _, end = _NUMBERED.fullmatch(name.lower()).groups()  # type: ignore[union-attr]
+        # Six digits before the last number are a date or a time.
+        kinds.setdefault(("" if sum(map(str.isdigit, begin)) >= 6 else begin, end), []).append(image)
+    if len(kinds) < 2 or len(kinds) > len(images) / 4:  # else names have nothing in common
+        return images, ""
+    best = min(kinds, key=lambda kind: (bool(NO_PICTURE.search("".join(kind))), -len(kinds[kind])))
+    there = ", ".join(f"{begin}*{end} ({len(of)})" for (begin, end), of in kinds.items())
+    return kinds[best], f"several recordings, {there}: {'*'.join(best)} is used, another where it is alone"
+
+
+def is_mjpeg(path: Path) -> bool:
+    """Whether a file holds JPEG images one after the other, as simple cameras write them: a video without a container.
+
+    Cameras append a preview to a picture: two are none.
+    """
+    return path.is_file() and path.read_bytes().count(b"\xff\xd9\xff\xd8\xff") > 1
+
+
+def _pictures_in(path: Path) -> int:
+    """Number of pages or of pictures of an animation in one file; 0 of one that OpenCV does not read."""
+    import cv2
+
+    with contextlib.suppress(cv2.error):
+        return int(cv2.imcount(str(path), cv2.IMREAD_UNCHANGED))
+    return 0

@@ -16,6 +16,7 @@ import numpy as np
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.file_kind import FileKind, file_kind, unpacking
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
+from drocap_ros.perception.sources.image_files import is_mjpeg
 
 if TYPE_CHECKING:
     import av
@@ -58,11 +59,12 @@ def pyav() -> Any:
     )
 
 
-def open_container(path: Path) -> InputContainer:
+def open_container(path: Path, form: str | None = None) -> InputContainer:
     """The container of a video file, which no other file or address can take part in."""
     av = pyav()
     # An absolute path is never taken for a protocol.
-    return av.open(str(path.absolute()), options={"protocol_whitelist": "file"}, metadata_errors="replace")  # type: ignore[no-any-return]
+    whitelist = {"protocol_whitelist": "file"}
+    return av.open(str(path.absolute()), format=form, options=whitelist, metadata_errors="replace")  # type: ignore[no-any-return]
 
 
 def codec_of(name: str) -> str | None:
@@ -82,6 +84,9 @@ class Decoder:
         self._aspect = aspect if aspect and 1 / Fraction(_MAX_ASPECT) <= aspect <= _MAX_ASPECT else Fraction(1)
         self._scaler = self._av.video.reformatter.VideoReformatter()
         self._size: tuple[int, int] | None = None
+        self._shape = Fraction(1)
+        #: Whether a later image is of another shape, and stretched.
+        self.reshaped = False
         self._progressive: Graph | None = None
         self._turn: int | None = None  # degrees, of the matrix by which images are shown
         self._matrix: Any = None
@@ -127,6 +132,8 @@ class Decoder:
         if self._size is None:
             across = max(self._aspect, Fraction(1))
             self._size = round(frame.width * across), round(frame.height * across / self._aspect)
+            self._shape = Fraction(frame.width, frame.height)
+        self.reshaped |= abs(Fraction(frame.width, frame.height) / self._shape - 1) > 0.02  # no rounding
         # The way of OpenCV and of the program ffmpeg.
         bgr = self._scaler.reformat(frame, *self._size, "bgr24", interpolation="BICUBIC").to_ndarray()
         pts = frame.dts if frame.pts is None else frame.pts
@@ -161,15 +168,15 @@ class VideoSource(ImageSource):
         self.path, self._track = path, track
         if not path.is_file():
             raise InputError(f"{path}: expected a video file, found no such file; check the path")
-        if (kind := file_kind(path)) is not FileKind.VIDEO:
+        if (kind := file_kind(path)) is not FileKind.VIDEO and not (kind is FileKind.IMAGE and is_mjpeg(path)):
             raise InputError(f"{path}: expected a video file, found {kind.value}{unpacking(path)}")
         self._error = pyav().error.FFmpegError
         try:
-            self._container = open_container(path)
+            self._container = open_container(path, None if kind is FileKind.VIDEO else "mjpeg")
         except self._error as error:
             raise InputError(
                 f"{path}: expected a video that FFmpeg can open, found {path.stat().st_size} bytes without a readable"
-                f" header or index ({first_line(error)}); copy it again"
+                f" header or index ({error.strerror or first_line(error)}); copy it again"
             ) from None
         self._closed = False
         self._last_ns: int | None = None
@@ -180,11 +187,12 @@ class VideoSource(ImageSource):
     def _begin(self) -> None:
         """Choose the track, read what the container states, and the first picture."""
         known = [stream for stream in self._container.streams.video if stream.codec_context is not None]
-        known = [s for s in known if not s.disposition & s.disposition.attached_pic] or known
-        if not known and self._container.streams.audio and not self._container.streams.video:
+        shown = [s for s in known if not s.disposition & s.disposition.attached_pic]
+        only_covers = not shown and len(known) == len(self._container.streams.video)
+        if only_covers and self._container.streams.audio:
             self.close()
             raise InputError(f"{self.path}: expected a video, found sound without pictures; name the video")
-        if not known:
+        if not (known := shown or known):
             raise self._refused(f"no video of a known codec ({', '.join(track_codes(self.path)) or 'no track'})")
         self._stream = self._chosen(known)
         self._stream.thread_type = "AUTO"
@@ -284,12 +292,15 @@ class VideoSource(ImageSource):
         if self._closed or self._last_ns is None:
             return
         end_s, before = self._last_ns * 1e-9, len(self._events)
+        if self._decoder.reshaped:
+            log.warning("%s: the shape of the images changes: later ones are stretched; cut it there", self.path)
         decoded = f"{self._count} of {self.length} frames decoded"
         if not self._stream.frames:
             decoded = f"{end_s:.1f} of {self._stated_s or end_s:.1f} s decoded"
         short = not self._stream.frames or (self.length is not None and self._count < self.length - _TAIL_FRAMES)
         tail_s = _TAIL_FRAMES * end_s / max(self._count - 1, 1)
-        if short and self._stated_s and end_s + tail_s < self._stated_s - _TAIL_FRAMES / self._rate_hz:
+        begin_s = max(self._origin_ns or 0, 0) * 1e-9  # in Matroska the duration is a time: that of the end
+        if short and self._stated_s and begin_s + end_s + tail_s < self._stated_s - _TAIL_FRAMES / self._rate_hz:
             self._tell(SourceEventKind.ENDED_EARLY, f"cut off or damaged, {decoded}")
         elif damaged := self._decoder.damaged:
             near = next((f" near {time_s:.1f} s" for time_s in damaged if time_s is not None), "")

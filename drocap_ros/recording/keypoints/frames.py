@@ -25,6 +25,7 @@ def one_person(
 
     Of several with one number, or without, the largest, then the nearest to it.
     """
+    people = followed(people)
     counted = Counter(who for _, who, _ in people).most_common()
     several = len({frame for frame, _, _ in people}) < len(people) or len(counted) > 1
     if subject is not None and not 1 <= subject <= len(counted):
@@ -47,45 +48,70 @@ def one_person(
     return chosen, words
 
 
-def of_one_recording(labels: list[Label]) -> tuple[list[Label], str]:
-    """Frames of the recording with most of them, and words on others, where the names of frames begin differently."""
-    names = list(dict.fromkeys(labels))
-    found: dict[str, list[Label]] = {}
-    for name in names:
-        found.setdefault(re.sub(r"\d+\D*$", "", name) if isinstance(name, str) else "", []).append(name)
-    # Six digits before the last number are a date or a time.
-    times = any(sum(map(str.isdigit, Path(begin).name)) >= 6 for begin in found)
-    # Recordings have at least four frames on average.
-    if len(found) < 2 or len(found) > len(names) / 4 or times:  # else the names hold other numbers
-        return labels, ""
-    best = max(found, key=lambda begin: len(found[begin]))
-    there = ", ".join(f"{begin}* ({len(of)} frames)" for begin, of in found.items())
-    return found[best], f"several recordings, {there}: {best}* is used; put one into a file for the others"
-
-
-def natural(label: Label) -> list[tuple[int, str]]:
-    """Sort key that puts frame_2 before frame_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(label)) if part]
-
-
 def numbers_of(labels: list[Label]) -> dict[Label, int]:
     """Number of each frame: the last one in its name where that tells frames apart, else its place."""
     names = list(dict.fromkeys(labels))
-    found = [re.findall(r"\d+", Path(n).stem if isinstance(n, str) else str(n))[-1:] for n in names]
+    whole = [int(n) if isinstance(n, float) and n.is_integer() else n for n in names]
+    found = [re.findall(r"\d+", Path(n).stem if isinstance(n, str) else str(n))[-1:] for n in whole]
     # Digits of a frame's number; longer ones are times or sums.
     numbers = [int(digits[0]) for digits in found if digits and len(digits[0]) < 10]
     return dict(zip(names, numbers if len(set(numbers)) == len(names) else range(len(names)), strict=True))
 
 
-def rate_of_times(times: Mapping[Label, tuple[str, float]]) -> float | None:
-    """Images per second by the times of frames, each with its key; None where they are of no video."""
+def seconds_of(times: Mapping[Label, tuple[str, float]], frames: np.ndarray) -> np.ndarray | None:
+    """(F,) s since the first of the frames' numbers, by the times of frames, each with its key; None where they are
+    those of no video.
+    """
     numbers = numbers_of(list(times))
     rows = sorted((numbers[frame], time) for frame, (_, time) in times.items())
-    if len(rows) < 2:
+    if len(rows) < 2 or not rows[0][0] <= frames[0] <= frames[-1] <= rows[-1][0]:
         return None
-    count, seconds = np.diff(np.array(rows, np.float64), axis=0).T
+    count, seconds = np.array(rows, np.float64).T
     key = next(iter(times.values()))[0]
     units = [factor for end, factor in _UNITS.items() if key.endswith(end)] or list(_UNITS.values())
-    step = float(np.median(seconds / np.maximum(count, 1)))
-    rates = [1 / (step * unit) for unit in units] if step > 0 else []
-    return next((rate for rate in rates if _RATES_HZ[0] <= rate <= _RATES_HZ[1]), None)
+    step = float(np.median(np.diff(seconds) / np.diff(count)))
+    unit = next((u for u in units if step > 0 and _RATES_HZ[0] <= 1 / (step * u) <= _RATES_HZ[1]), None)
+    at_s = None if unit is None else np.interp(frames, count, (seconds - seconds[0]) * unit)
+    return None if at_s is None or (np.diff(at_s) <= 0).any() else at_s - at_s[0]
+
+
+#: Shares of a person's size by which he moves from one frame to the next at most, and how many frames he may be lost.
+_OWN_STEP, _OTHER_STEP, _LOST = 0.5, 0.25, 30
+
+
+def followed(people: list[tuple[int, Label, np.ndarray]]) -> list[tuple[int, Label, np.ndarray]]:
+    """The same persons, each with one number: trackers give a new one after a loss, and exchange those of two.
+
+    A person keeps its number as long as it is near; else the nearest one goes on, then the one with its number.
+    """
+    if any(who is None for _, who, _ in people):
+        return people
+    last: dict[Label, tuple[int, Label, np.ndarray]] = {}  # by our number: frame, number in the file, points
+    by_frame: dict[int, list[tuple[Label, np.ndarray]]] = {}
+    for frame, who, points in people:
+        by_frame.setdefault(frame, []).append((who, points))
+    found: list[tuple[int, Label, np.ndarray]] = []
+    for frame in sorted(by_frame):
+        pairs = []
+        for i, (who, points) in enumerate(by_frame[frame]):
+            for own, (before, theirs, old) in last.items():
+                step, missed = _step(old, points), frame - before - 1
+                near = step <= (_OWN_STEP if who == theirs else _OTHER_STEP) * (1 + 0.1 * missed) and missed <= _LOST
+                rank = 0 if who == theirs and near else 1 if near else 2
+                pairs += [(rank, step, i, own)] * (near or who == theirs)
+        chosen: dict[int, Label] = {}
+        for _, _, i, own in sorted(pairs, key=lambda pair: pair[:3]):
+            if i not in chosen and own not in chosen.values():
+                chosen[i] = own
+        for i, (who, points) in enumerate(by_frame[frame]):
+            own = chosen.get(i, who if who not in last else f"{who} from {frame}")
+            last[own] = frame, who, points
+            found.append((frame, own, points))
+    return found
+
+
+def _step(old: np.ndarray, new: np.ndarray) -> float:
+    """Median way of the points that both frames show, as a share of the person's size; infinite without any."""
+    both = np.isfinite(old[:, 0]) & np.isfinite(new[:, 0])
+    size = float(np.ptp(old[np.isfinite(old[:, 0]), :2], axis=0).max(initial=0.0))
+    return float(np.median(np.abs(new - old)[both, :2].max(axis=1))) / max(size, 1e-9) if both.any() else np.inf

@@ -51,6 +51,10 @@ ORDERS: dict[str, tuple[str, ...]] = {
     "openpose25": _order(
         f"nose neck R:{_ARM} L:{_ARM} hip R:{_LEG} L:{_LEG} {_FACE} L:big_toe,small_toe,heel R:big_toe,small_toe,heel"
     ),
+    "openpose25b": _order(
+        "nose LR:eye,ear,shoulder,elbow,wrist,hip,knee,ankle neck head_top L:big_toe,small_toe,heel"
+        " R:big_toe,small_toe,heel"
+    ),
     "openpose19": _order(f"nose neck R:{_ARM} L:{_ARM} hip R:{_LEG} L:{_LEG} {_FACE}"),
     "openpose18": _order(f"nose neck {_LIMBS} {_FACE}"),
     "openpose15": _order(f"head_top neck {_LIMBS} chest"),
@@ -117,7 +121,7 @@ def name_points(xy: np.ndarray, stated: Sequence[str], wanted: str | None, tool:
         return ORDERS[order_named(wanted, count)], ""
     # Limb joints among stated names from which these are a body's.
     if len(stated) == count and len(limbs_of(names := names_of(stated))) >= 4:
-        return names, ""
+        return names, _turned(xy, names) if is_no_body(xy, names) else ""
     known = [name for name in orders_of(count) if name.startswith(tool)] or orders_of(count)
     if not known:
         raise InputError(f"expected points with names, or {', '.join(map(str, counts()))} of them, found {count}")
@@ -129,11 +133,17 @@ def name_points(xy: np.ndarray, stated: Sequence[str], wanted: str | None, tool:
     if (others and best < others[0] + 0.25) or is_no_body(xy, ORDERS[name], strict=True):
         raise InputError(
             f"expected the names of {count} joints, found none, and no known order that clearly makes a body of them;"
-            f" name the joints in the file, or {_say(known)}"
+            f" {_turned(xy, ORDERS[name]) or 'name the joints in the file'}, or {_say(known)}"
         )
     more = ", ".join(other for other in known if other != name)
     words = f"{count} points without names: taken in the order {name}, which makes a body"
     return ORDERS[name], f"{words} ({more}: no); --order NAME chooses another" if more else words
+
+
+def _turned(xy: np.ndarray, names: Sequence[str]) -> str:
+    """Words where points are a body's with x and y exchanged, as MoveNet and ViTPose write them."""
+    is_one = not is_no_body(xy[..., ::-1], names, strict=True)
+    return "x and y exchanged make a body of them: exchange them in the file" if is_one else ""
 
 
 def _say(known: Sequence[str]) -> str:

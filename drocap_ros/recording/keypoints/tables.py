@@ -11,21 +11,39 @@ from pathlib import Path
 from typing import TypeAlias
 
 from drocap_ros.errors import InputError
+from drocap_ros.recording.keypoints.orders import counts
+from drocap_ros.recording.text import rows_of
 from drocap_ros.tracks import MAX_FRAMES
 
 #: A frame, or a person in one.
 Frame: TypeAlias = "Mapping[str, object]"
-#: Characters of a line: whole bodies have some thousands.
-_LINE = 1 << 16
 #: Columns of a frame, a person and a point's name; "time" is no number of a frame.
 _FRAME = ("frame_idx", "frame_index", "frame_id", "frame", "image_id", "image", "img", "file_name", "image_name")
 _WHO = ("track", "track_id", "person_id", "person", "instance_id")
 _PART = ("landmark", "landmark_name", "keypoint", "keypoint_name", "joint", "joint_name", "bodypart", "name", "part")
-_AXIS = "x|y|z|score|confidence|conf|likelihood|visibility|v|c|p"
-#: A column's point and axis: ``nose_x`` or ``x_nose``, ``x0``.
+_SCORES = dict.fromkeys(
+    [
+        "confidence",
+        "conf",
+        "likelihood",
+        "visibility",
+        "visible",
+        "vis",
+        "presence",
+        "probability",
+        "prob",
+        "v",
+        "c",
+        "p",
+    ],
+    "score",
+)
+_AXIS = "|".join(("x", "y", "z", "score", *_SCORES))
+#: A column's point and axis, after which its unit may stand: ``nose_x``, ``NoseX`` or ``x_nose``, ``x0``.
+_UNIT = re.compile(r" *[(\[_]*(?:px|pixels?)[)\]]*", re.IGNORECASE)
 _COLUMN = re.compile(rf"(.+)[._\- ]({_AXIS})", re.IGNORECASE)
+_CAMEL = re.compile(r"(.*[a-z\d])([XYZVC])")
 _TURNED = re.compile(rf"({_AXIS})[._\- ]?(\d+|(?<=[._\- ]).+)", re.IGNORECASE)
-_SCORES = dict.fromkeys(("confidence", "conf", "likelihood", "visibility", "v", "c", "p"), "score")
 
 
 #: What opens and closes in JSON, and texts, in which nothing does.
@@ -38,7 +56,7 @@ def read_json(path: Path) -> tuple[object, int]:
     try:
         return json.loads(data), 0
     except (ValueError, RecursionError) as error:
-        text = data.decode("utf-8", "replace")
+        text = data.decode("utf-8-sig", "replace")
         lines = [line for line in text.splitlines() if line.strip()]
         nodes = [node for line in lines[: MAX_FRAMES + 1] if isinstance(node := _parsed(line), dict | list)]
         if len(nodes) > len(lines) / 2:
@@ -74,28 +92,19 @@ def _closed(text: str) -> str:
 def is_keypoint_table(path: Path) -> bool:
     """Whether the first line of a table is that of keypoints, and no flight log's."""
     try:
-        return _kind(next(_rows(path), [])) is not None
+        return _kind(next(rows_of(path), [])) is not None
     except (OSError, UnicodeError, csv.Error):
         return False
 
 
 def read_table(path: Path) -> Iterator[Frame]:
     """Frames, or rows, as the JSON of a person in a frame."""
-    rows = _rows(path)
+    rows = rows_of(path)
     first = next(rows, [])
     read = _kind(first)
     if read is None:
         raise InputError("expected a table of keypoints: DeepLabCut's, or columns as nose_x, nose_y; found another")
     return read(itertools.chain([first], rows))
-
-
-def _rows(path: Path) -> Iterator[list[str]]:
-    with path.open("r", encoding="utf-8-sig", errors="replace", newline="") as file:
-        first = file.readline(_LINE)
-        lines = itertools.chain([first], iter(lambda: file.readline(_LINE), ""))
-        for row in csv.reader(lines, delimiter=max(",;\t", key=first.count)):
-            if row:
-                yield [cell.strip() for cell in row]
 
 
 def _kind(head: list[str]) -> Callable[[Iterator[list[str]]], Iterator[Frame]] | None:
@@ -113,7 +122,8 @@ def _columns(head: list[str]) -> dict[str, dict[str, int]]:
     """Columns of each point that has both coordinates."""
     found: dict[str, dict[str, int]] = {}
     for i, name in enumerate(head):
-        if (match := _COLUMN.fullmatch(name)) is not None:
+        name = _UNIT.sub("", name) if name[-1:] in "lxs)]" else name
+        if (match := _COLUMN.fullmatch(name) or _CAMEL.fullmatch(name)) is not None:
             point, axis = match.groups()
         elif (match := _TURNED.fullmatch(name)) is not None:
             axis, point = match.groups()
@@ -162,14 +172,28 @@ def _long(rows: Iterator[list[str]]) -> Iterator[Frame]:
 def _deeplabcut(rows: Iterator[list[str]]) -> Iterator[Frame]:
     """Rows that begin with scorer, individuals, bodyparts, coords; then one row a frame."""
     first = list(itertools.islice(rows, 4))
-    head = {row[0]: row[1:] for row in first if not row[0].isdigit()}
+    head = {row[0]: row for row in first if row[0] in ("scorer", "individuals", "bodyparts", "coords")}
     if not {"bodyparts", "coords"} <= head.keys():
         raise InputError("expected the rows bodyparts and coords of DeepLabCut, found others; export the CSV again")
+    begin = next((i for i, cell in enumerate(head["coords"]) if i and cell), 1)  # labels have folders in the first ones
     whose = head.get("individuals", [""] * len(head["coords"]))
-    columns = list(zip(whose, head["bodyparts"], head["coords"], strict=False))
+    columns = list(zip(whose, head["bodyparts"], head["coords"], strict=False))[begin:]
     for row in itertools.chain(first[len(head) :], rows):
         people: dict[str, dict[str, dict[str, str]]] = {}
-        for (who, part, coord), text in zip(columns, row[1:], strict=False):
+        for (who, part, coord), text in zip(columns, row[begin:], strict=False):
             people.setdefault(who, {}).setdefault(part, {"name": part})[coord] = text
         persons = [{"person_id": who, "keypoints": list(parts.values())} for who, parts in people.items()]
-        yield {"frame_id": row[0], "people": persons}
+        yield {"frame_id": "/".join(row[:begin]), "people": persons}
+
+
+def read_yolo(path: Path) -> list[Frame]:
+    """Persons of a label file of YOLO's: class, box, points in shares of the picture, a score and a number."""
+    people: list[Frame] = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines()[:1000]:
+        cells = line.split()
+        sizes = ((each, more) for each in (3, 2) for more in (0, 1, 2))
+        fitting = ((e, m) for e, m in sizes if (len(cells) - 5 - m) % e == 0 and (len(cells) - 5 - m) // e in counts())
+        if (found := next(fitting, None)) is not None:
+            number = {"track_id": cells[-1]} if found[1] and cells[-1].isdecimal() else {}
+            people.append({**number, "keypoints": cells[5 : len(cells) - found[1]]})
+    return people

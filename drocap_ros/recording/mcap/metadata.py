@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import sys
 from dataclasses import dataclass
 from functools import lru_cache
@@ -39,6 +38,19 @@ def own_definitions() -> dict[str, str]:
     return {f"{PACKAGE}/msg/{path.stem}": path.read_text(encoding="utf-8") for path in sorted(folders[0].glob("*.msg"))}
 
 
+#: Definitions of images in other packages, which recordings before ROS 2 Iron do not hold.
+_OTHERS = {
+    name: text.replace("; ", "\n")
+    for text, *names in (
+        ("std_msgs/Header header; int32 width; int32 height; string encoding; uint64 pts; uint8 flags;"
+         " bool is_bigendian; uint8[] data", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"),
+        ("builtin_interfaces/Time timestamp; string frame_id; uint8[] data; string format",
+         "foxglove_msgs/msg/CompressedImage", "foxglove_msgs/msg/CompressedVideo"),
+    )
+    for name in names
+}  # fmt: skip
+
+
 @lru_cache(maxsize=1)
 def standard_types() -> Typestore:
     """Message types of the ROS distribution and this package's."""
@@ -46,7 +58,7 @@ def standard_types() -> Typestore:
 
     store = get_typestore(Stores[f"ROS2_{ROS_DISTRIBUTION.upper()}"])
     types = {}
-    for name, text in own_definitions().items():
+    for name, text in {**own_definitions(), **_OTHERS}.items():
         types.update(get_types_from_msg(text, name))
     store.register(types)
     return store
@@ -218,18 +230,15 @@ def custom_metadata(description: Yaml) -> dict[str, str]:
 
 def storage_files(folder: Path, description: Yaml) -> list[Path]:
     """Files of a folder in their order, with MCAP files that a crash left out of the description."""
-    there = sorted(folder.glob("[!.]*.mcap"), key=_by_number)
+    from drocap_ros.perception.sources.image_files import natural
+
+    there = sorted(folder.glob("[!.]*.mcap"), key=lambda file: natural(file.name))
     named = description.get("relative_file_paths")
     files = [folder / Path(str(name)).name for name in named] if isinstance(named, list) else []
     if not all(file.is_file() for file in files):
         return there
     others = any(file.suffix != ".mcap" for file in files)
     return files if others else files + [p for p in there if p not in files]
-
-
-def _by_number(path: Path) -> tuple[int | str, ...]:
-    """``s_10`` comes after ``s_9``."""
-    return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name))
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -4,11 +4,12 @@ DJI flight record as its readers export it; also as a spreadsheet saves it, with
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import itertools
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -17,18 +18,19 @@ import numpy as np
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.recording.telemetry.log import (
-    Lens,
+    Lack,
     LogFormat,
+    LogLack,
     Series,
     TelemetryLog,
     dji_attitude,
     from_first_fix,
+    lens_of_views,
     make_log,
     plausible,
 )
+from drocap_ros.recording.text import rows_of
 
-#: Characters of a line, beyond which the file is no table: Airdata's lines have about a thousand.
-_LINE = 16384
 #: Rows: five hours at Airdata's ten a second.
 _MAX_ROWS = 200_000
 _GIMBAL, _AIRCRAFT = ("gimbal pitch", "gimbal roll", "gimbal yaw"), ("pitch", "roll", "yaw")
@@ -68,6 +70,8 @@ def read_airdata(path: Path) -> TelemetryLog:
     geodetic = table.columns("latitude", "longitude", "height")
     found, lacks = plausible(path, Series(stamp_ns, gimbal, table.columns(*_AIRCRAFT), geodetic))
     utc_s = table.columns("utc")[:, 0] - stamp_ns * 1e-9
+    lens, zoom = lens_of_views(table.columns("view")[:, 0], "as the log states")
+    lacks += [*zoom, *table.lacks]
     video = true_runs(table.columns("video")[:, 0] == 1)
     body, camera = dji_attitude(found.aircraft), dji_attitude(found.gimbal)
     place = from_first_fix(found.geodetic, above_takeoff=True)
@@ -76,21 +80,15 @@ def read_airdata(path: Path) -> TelemetryLog:
         # The column has whole seconds.
         utc_minus_stamp_ns=round((float(np.nanmedian(utc_s)) + 0.5) * 1e9) if np.isfinite(utc_s).any() else None,
         video_parts=tuple((int(stamp_ns[a]), int(stamp_ns[b - 1])) for a, b in video),
-        lens=_lens(table.columns("view")[:, 0]),
+        lens=lens,
     )
-
-
-def _lens(view_deg: np.ndarray) -> Lens:
-    """The lens of a column of fields of view (N,) deg, the usual one where there is none."""
-    stated = view_deg[(view_deg >= 5) & (view_deg <= 170)]
-    return Lens.of_view(float(np.median(stated)), "as the log states") if len(stated) else Lens()
 
 
 class _Table:
     """Rows of a file at times that increase; a column that is not there is NaN."""
 
     def __init__(self, path: Path) -> None:
-        cells = _cells(path)
+        cells = rows_of(path)
         head = [name.strip().lower() for name in next(cells, [])]
         found: dict[str, tuple[int, float]] = {}
         for i, title in enumerate(head):
@@ -107,7 +105,14 @@ class _Table:
         time_ms = table[:, self._names.index("time")]
         # A later time than eleven days is damage.
         table = table[(time_ms >= 0) & (time_ms < 1e9)]
-        self._rows = table[np.unique(table[:, self._names.index("time")], return_index=True)[1]]
+        at, self.lacks = self._names.index("time"), list[LogLack]()
+        # Where the time begins anew another flight does.
+        flights = np.split(table, np.flatnonzero(np.diff(table[:, at]) < -1000) + 1)
+        if 1 < len(flights) < len(table) / 10:
+            table = max(flights, key=len)
+            words = f"flights in the log, of {', '.join(map(str, map(len, flights)))} rows: the longest is used"
+            self.lacks.append(LogLack(Lack.SEVERAL, words))
+        self._rows = table[np.unique(table[:, at], return_index=True)[1]]
         if not len(self._rows):
             raise InputError(f"{path}: expected rows with a time, found none; export the flight again")
 
@@ -117,18 +122,6 @@ class _Table:
     def columns(self, *names: str) -> np.ndarray:
         rows = np.pad(self._rows, ((0, 0), (0, 1)), constant_values=np.nan)  # the last column is the unknown one
         return rows[:, [self._names.index(name) if self.has(name) else -1 for name in names]]
-
-
-def _cells(path: Path) -> Iterator[list[str]]:
-    """Rows as text; where the comma is for decimals a spreadsheet writes semicolons or tabs, and may name them."""
-    with path.open("rb") as file:
-        wide = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
-    with path.open("r", encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as text:
-        first = text.readline(_LINE)
-        if first.lower().startswith("sep="):
-            first = text.readline(_LINE)
-        lines = itertools.chain([first], iter(lambda: text.readline(_LINE), ""))
-        yield from csv.reader(lines, delimiter=max(",;\t", key=first.count))
 
 
 def _column(title: str) -> tuple[str, float] | None:
@@ -156,8 +149,6 @@ def _number(text: str) -> float:
     text = text.strip().lower()
     if time := _FLY_TIME.fullmatch(text):
         return 3600.0 * float(time[1] or 0) + 60.0 * float(time[2] or 0) + float(time[3])
-    if text.count(",") == 1 and "." not in text:
-        text = text.replace(",", ".")
     try:
         value = float({"true": "1", "false": "0"}.get(text, text))
     except ValueError:
@@ -166,10 +157,12 @@ def _number(text: str) -> float:
 
 
 def _utc_s(text: str) -> float:
-    try:
-        return datetime.strptime(text.strip(), "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc).timestamp()
-    except (ValueError, OverflowError):
-        return math.nan
+    """Time of a date, whose year a spreadsheet may have put last, behind the day."""
+    year_first = re.sub(r"^(\d\d?)\.(\d\d?)\.(\d{4})", r"\3-\2-\1", text.strip()).replace("/", "-").replace("T", " ")
+    for form in ("%Y-%m-%d %H:%M:%S", "%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%d %H:%M"):
+        with contextlib.suppress(ValueError, OverflowError):
+            return datetime.strptime(year_first.removesuffix("Z"), form).replace(tzinfo=timezone.utc).timestamp()
+    return math.nan
 
 
 FORMAT = LogFormat(".csv", read_airdata)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _FIELDS = {
     "ATT": ("Roll", "Pitch", "Yaw"),
     "POS": ("Lat", "Lng", "Alt"),
-    "GPS": ("Lat", "Lng", "Alt", "Status"),
+    "GPS": ("Lat", "Lng", "Alt", "Status", "I"),
     "MNT": ("Roll", "Pitch", "YawE", "YawB", "I"),
 }
 _PARAMETER = "PARM"
@@ -111,8 +111,12 @@ def _position(content: _Content, stamp_ns: np.ndarray) -> tuple[np.ndarray | Non
         if not content.rows[name]:
             continue
         known_ns, geodetic = content.series(name)
-        lost = (geodetic[:, :2] == 0).all(axis=1) | (geodetic[:, 3:] < FIX_3D).any(axis=1)
+        lost = (geodetic[:, :2] == 0).all(axis=1) | (geodetic[:, 3:4] < FIX_3D).any(axis=1)
         geodetic[lost] = np.nan
+        receivers = np.nan_to_num(geodetic[:, 4:]).ravel()  # whose places differ by metres
+        if name == "GPS" and len(np.unique(receivers)) > 1:
+            number = max(np.unique(receivers), key=lambda each: (receivers == each).sum())
+            known_ns, geodetic = known_ns[receivers == number], geodetic[receivers == number]
         if (enu := from_first_fix(geodetic[:, :3])) is not None:
             return at_stamps(known_ns, enu, stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, name)]
     return None, []

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.etree.ElementTree import ParseError, iterparse
+from xml.etree.ElementTree import ParseError, fromstring, iterparse
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def read_gpx(path: Path, *, track: str = "") -> TelemetryLog:
     order = np.unique(stamp_ns, return_index=True)[1]
     stamp_ns, place = stamp_ns[order], place[order]
     if damaged:
-        lacks.append(LogLack(Lack.DAMAGED, "read up to the damage"))
+        lacks.append(LogLack(Lack.DAMAGED, "points about the damage are missing"))
     if np.isnan(place[:, 2]).all():
         place[:, 2] = 0.0
         lacks.append(LogLack(Lack.HEIGHT_UNKNOWN))
@@ -72,9 +73,22 @@ def _tracks(path: Path) -> tuple[dict[int, list[_Point]], bool]:
                         count += 1
                         found.setdefault(number, []).append(point)
                     element.clear()
-    except ParseError:
-        return found, True
+    except ParseError:  # the points behind the damage are read one by one
+        return _one_by_one(path) or found, True
     return found, False
+
+
+def _one_by_one(path: Path) -> dict[int, list[_Point]]:
+    """Points that are whole, by the number of their track."""
+    found: dict[int, list[_Point]] = {}
+    number = 0
+    for part in re.finditer(r"<trk>|<trkpt .*?</trkpt>", path.read_text(encoding="utf-8", errors="replace"), re.DOTALL):
+        with contextlib.suppress(ParseError):
+            point = None if part[0] == "<trk>" else _point(fromstring(part[0]))
+            number += part[0] == "<trk>"
+            if point is not None:
+                found.setdefault(number, []).append(point)
+    return found
 
 
 def _point(element: Element) -> _Point | None:

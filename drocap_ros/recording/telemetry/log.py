@@ -330,6 +330,16 @@ class LogLack(NamedTuple):
         return self.kind.value.format(self.detail)
 
 
+def lens_of_views(view_deg: np.ndarray, origin: str) -> tuple[Lens | None, list[LogLack]]:
+    """The lens of horizontal fields of view (N,) deg, the usual one where none is known; None and why if it changes."""
+    stated = view_deg[(view_deg >= 5) & (view_deg <= 170)]
+    if not len(stated):
+        return Lens(), []
+    if np.ptp(stated) > 0.01 * np.median(stated):
+        return None, [LogLack(Lack.ZOOM, f"{stated.min():.0f} deg to {stated.max():.0f} deg")]
+    return Lens.of_view(float(np.median(stated)), origin), []
+
+
 class TelemetryLog(NamedTuple):
     """States of the vehicle from a log.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import unpacking
 from drocap_ros.recording.telemetry import airdata, dataflash, djmd, gpx, srt, tlog, ulog
 from drocap_ros.recording.telemetry.log import LogFormat, TelemetryLog
 
@@ -30,7 +31,8 @@ def read_telemetry(path: str | Path) -> TelemetryLog:
         fitting = [f for f in FORMATS if f.begins(head)] or [f for f in FORMATS if f.suffix and f.suffix == suffix]
         if not fitting:
             raise InputError(
-                f"{path}: expected a telemetry log ({', '.join(LOG_SUFFIXES)}, DJI video), found another; check it"
+                f"{path}: expected a telemetry log ({', '.join(LOG_SUFFIXES)}, DJI video), found another"
+                f"{unpacking(path)}"
             )
         return fitting[0].read(path, **_keywords(path, choice, fitting[0]))
     except FileNotFoundError:

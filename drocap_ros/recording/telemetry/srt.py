@@ -27,9 +27,11 @@ from drocap_ros.recording.telemetry.log import (
     TelemetryLog,
     dji_attitude,
     from_first_fix,
+    lens_of_views,
     make_log,
 )
 from drocap_ros.recording.telemetry.video_tracks import find_track, read_samples
+from drocap_ros.recording.text import open_text
 from drocap_ros.tracks import MAX_FRAMES
 
 #: Formats of a video's subtitle tracks: of MP4 (3GPP TS 26.245, QuickTime), whose texts begin with their length, and by
@@ -49,11 +51,10 @@ _CLOCK = re.compile(r"\d\s+(\d{1,2}):(\d\d):(\d\d[.,]\d{3})")
 _GPS = re.compile(
     rf"\b(?:GPS|RTK)\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I
 )
-_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
+_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*[:(]\s*{_NUMBER}|[,\s]H\s*=?\s*{_NUMBER}\s*m")
 #: Place of take-off, and the distance from it, m.
-_DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*{_NUMBER}\s*m")
+_DISTANCE = re.compile(rf"\bHOME\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}[^\n]*\bD\s*=?\s*{_NUMBER}\s*m")
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
-_VIEWS_DEG = (5.0, 170.0)  # possible fields of view
 #: Horizontal field of view, deg.
 _VIEW = re.compile(rf"\b(?:fov_?h|h_?fov|horizontal_?fov|fov_?horizontal)\s*[:=]\s*{_NUMBER}", re.IGNORECASE)
 #: Pitch, roll and yaw; the degree sign may be in any encoding.
@@ -68,7 +69,7 @@ class _Entry(NamedTuple):
     kind : of the height, "" = none
     clock_s : time of day
     home : place of take-off in the order of the text, and the distance from it, m
-    plain : whether nothing beside the numbers says which of them is the latitude
+    plain : 1 where nothing beside the numbers says which of them is the latitude, 2 beside a height
     """
 
     stamp_ns: int
@@ -79,7 +80,7 @@ class _Entry(NamedTuple):
     lens: tuple[float, float, float]
     clock_s: float
     home: tuple[float, float, float]
-    plain: bool
+    plain: float
 
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
@@ -90,7 +91,7 @@ def read_srt(path: Path) -> TelemetryLog:
     entries = _entries(path)
     stamps, places, kinds, gimbal, body, lens, clock_s, home, plain = map(np.array, zip(*entries, strict=True))
     if _latitude_first(places, home, plain):
-        places[plain, :2] = places[plain, 1::-1]
+        places[plain > 0, :2] = places[plain > 0, 1::-1]
     heights = next((kind for kind in _HEIGHTS if kind in kinds), "height")
     position = from_first_fix(_geodetic(places), above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
@@ -100,11 +101,8 @@ def read_srt(path: Path) -> TelemetryLog:
     real_s, shown_s = clock_s[-1] - clock_s[0], float(stamps[-1] - stamps[0]) * 1e-9
     if 1 < real_s < shown_s / 1.5:  # a second or more, and no rounding of the dates
         lacks.append(LogLack(Lack.SLOW, f"{shown_s / real_s:.1f}"))
-    steady = _lens(lens)
-    if steady is None:
-        seen = lens[:, 2] if np.isfinite(lens[:, 2]).any() else np.nanprod(lens[:, :2], axis=1)
-        unit = "deg" if np.isfinite(lens[:, 2]).any() else "mm"
-        lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(seen):.0f} {unit}" for f in (np.nanmin, np.nanmax))))
+    steady, zoom = _lens(lens)
+    lacks += zoom
     attitudes = {"orientation": dji_attitude(body), "gimbal": dji_attitude(gimbal)}
     log = make_log(path, "DJI subtitles", stamps, lacks, position=position, **attitudes)
     return log._replace(video_clock=True, lens=steady)
@@ -123,18 +121,21 @@ def _entries(path: Path) -> list[_Entry]:
 def _latitude_first(places: np.ndarray, home: np.ndarray, plain: np.ndarray) -> bool:
     """Whether plain pairs, taken as longitude and latitude, are the other way round.
 
-    A latitude is below 90 degrees, and the distance from take-off fits one order.
+    A latitude is below 90 degrees, the distance from take-off fits one order, and before a height it comes first.
     """
-    latitude, longitude = places[plain, :2].T
+    latitude, longitude = places[plain > 0, :2].T
     if (np.abs(latitude) > 90).any():
         return bool((np.abs(longitude) <= 90).all())
-    east, north = longitude - home[plain, 0], latitude - home[plain, 1]
+    if (np.abs(longitude) > 90).any():
+        return False
+    (at_east, at_north, way), by_height = home[plain > 0].T, bool((plain > 1).any())
+    east, north = longitude - at_east, latitude - at_north
     off = [
-        np.abs(METRES_PER_DEG * np.hypot(dx * np.cos(np.deg2rad(at)), dy) - home[plain, 2])
+        np.abs(METRES_PER_DEG * np.hypot(dx * np.cos(np.deg2rad(at)), dy) - way)
         for dx, dy, at in ((east, north, latitude), (north, east, longitude))
     ]
     as_is, turned = (float(np.nansum(errors)) for errors in off)
-    return turned < 0.5 * as_is
+    return turned < 0.5 * as_is or (by_height and not as_is < 0.5 * turned)
 
 
 def _geodetic(places: np.ndarray) -> np.ndarray:
@@ -158,8 +159,9 @@ def _inside(path: Path) -> Iterator[tuple[int, str]]:
 def _subtitles(path: Path) -> Iterator[tuple[int, str]]:
     """Time ns in the video and text of each subtitle."""
     stamp_ns, text = None, ""
-    with path.open("r", encoding="utf-8", errors="replace") as file:
+    with open_text(path) as file:
         while line := file.readline(_LINE):
+            line = re.sub(r"(:\s*-?\d+),(?=\d)", r"\1.", line)  # a decimal comma
             match = _TIME.search(line)
             if match is None:
                 text = (text + line)[:_LINE]
@@ -190,7 +192,7 @@ def _entry(stamp_ns: int, text: str) -> _Entry | None:
     gimbal, body = (angles.get(of, _UNKNOWN) for of in "GF")
     way = _DISTANCE.search(text)
     home = (float(way[1]), float(way[2]), float(way[3])) if way else _UNKNOWN
-    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text), home, "plain" in values)
+    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text), home, values.get("plain", 0.0))
 
 
 def _values(text: str) -> dict[str, float]:
@@ -206,7 +208,7 @@ def _values(text: str) -> dict[str, float]:
         if gps[6] or "." in gps[5]:  # else the number of satellites
             values["altitude"] = float(gps[5])
         if not gps[1] and not gps[6]:
-            values["plain"] = 1.0
+            values["plain"] = 2.0 if "." in gps[5] else 1.0
     if barometer := _BAROMETER.search(text):
         values["barometer"] = float(barometer[1] or barometer[2])
     return values
@@ -231,19 +233,16 @@ def _focal(text: str) -> tuple[float, float, float]:
     return float(focal) * (1.0 if "." in focal else 0.1), float(zoom) * factor, float(view[1]) if view else math.nan
 
 
-def _lens(values: np.ndarray) -> Lens | None:
-    """The lens of all subtitles (N, 3); the usual one where they state none; None where it changes."""
-    view = values[(values[:, 2] >= _VIEWS_DEG[0]) & (values[:, 2] <= _VIEWS_DEG[1]), 2]
+def _lens(values: np.ndarray) -> tuple[Lens | None, list[LogLack]]:
+    """The lens of all subtitles (N, 3), the usual one where they state none; None and why where it changes."""
     stated = values[(values[:, 0] >= 5) & (values[:, 0] <= 1000) & (values[:, 1] >= 1) & (values[:, 1] <= 100), :2]
-    for each in (view[:, None], stated):
-        if len(each) and (np.ptp(each, axis=0) > 0.01 * np.median(each, axis=0)).any():
-            return None
-    if len(view):
-        return Lens.of_view(float(np.median(view)), "as the subtitles state")
-    if not len(stated):
-        return Lens()
+    if len(stated) and (np.ptp(stated, axis=0) > 0.01 * np.median(stated, axis=0)).any():
+        seen = stated.prod(axis=1)
+        return None, [LogLack(Lack.ZOOM, f"{seen.min():.0f} mm to {seen.max():.0f} mm")]
+    if np.isfinite(values[:, 2]).any() or not len(stated):
+        return lens_of_views(values[:, 2], "as the subtitles state")
     focal, zoom = np.median(stated, axis=0)
-    return Lens(float(focal), f"{focal:g} mm equivalent of the subtitles, full sensor width assumed", float(zoom))
+    return Lens(float(focal), f"{focal:g} mm equivalent of the subtitles, full sensor width assumed", float(zoom)), []
 
 
 FORMAT = LogFormat(".srt", read_srt)

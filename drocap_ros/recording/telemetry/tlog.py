@@ -11,7 +11,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.telemetry.log import LogFormat, LogLack, TelemetryLog, choose, make_log
+from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, choose, make_log
 
 if TYPE_CHECKING:
     from pymavlink.dialects.v20.ardupilotmega import MAVLink_message
@@ -21,6 +21,8 @@ _MIN_UTC_NS = 1_000_000_000 * 10**9
 #: First bytes of a packet of MAVLink 1 and 2, https://mavlink.io/en/guide/serialization.html.
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD  # of MAVLink 2
+#: Bytes of a packet and its time.
+_LARGEST = 300
 #: Bytes read at once.
 _CHUNK = 1 << 20
 
@@ -60,8 +62,10 @@ def _chosen(path: Path, vehicle: str, mount: str) -> tuple[int, int, list[LogLac
     from drocap_ros.flight.mavlink.parser import MavlinkParser
 
     attitudes, gimbals, parser = Counter[int](), Counter[tuple[int, int]](), MavlinkParser()
+    used = 0
     with path.open("rb") as file:
         for _, packet in _packets(file):
+            used += 8 + len(packet)
             newer = packet[0] == _MAGIC_V2
             kind = int.from_bytes(packet[7:10] if newer else packet[5:6], "little")
             if kind in _ATTITUDES:  # without the time that decoding takes
@@ -70,10 +74,13 @@ def _chosen(path: Path, vehicle: str, mount: str) -> tuple[int, int, list[LogLac
                 gimbals.update((message.get_srcSystem(), _gimbal_of(message)) for message in parser.feed(packet))
     if not attitudes:
         return 0, 0, []
+    # The last packet of a log may be cut off.
+    lost = max(path.stat().st_size - used - _LARGEST, 0)
+    damage = [LogLack(Lack.DAMAGED, f"{lost} bytes and more are no messages, left out")] * (lost > 0)
     system, lacks = choose(path, "vehicle", {str(s): n for s, n in sorted(attitudes.items())}, vehicle)
     own = {str(gimbal): n for (of, gimbal), n in sorted(gimbals.items()) if str(of) == system}
     component, more = choose(path, "mount", own, mount) if own or mount else ("0", [])
-    return int(system), int(component), lacks + more
+    return int(system), int(component), damage + lacks + more
 
 
 def _gimbal_of(message: MAVLink_message) -> int:

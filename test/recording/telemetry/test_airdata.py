@@ -12,6 +12,7 @@ from telemetry_logs import angles_of, mutated, wrapped
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.geodesy import geodetic_to_enu
+from drocap_ros.recording.telemetry.log import Lack
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.video_telemetry import OffsetSource, find_offset
 
@@ -151,3 +152,41 @@ def attempt(path):
         return read_telemetry(path).track.stamp_ns, ""
     except InputError as error:
         return np.zeros(0), str(error)
+
+
+@pytest.mark.parametrize("form", ["{}", "{}Z", "{}.250"])
+@pytest.mark.parametrize("day", [lambda y, m, d: f"{y}-{m}-{d} ", lambda y, m, d: f"{y}/{m}/{d} ",
+                                 lambda y, m, d: f"{d}.{m}.{y} ", lambda y, m, d: f"{y}-{m}-{d}T"])  # fmt: skip
+def test_dates_of_a_spreadsheet_are_times(tmp_path, form, day):
+    path = write_airdata(tmp_path / "f.csv", [(1.0, 30.0)])
+    text = re.sub(
+        r"2026-05-01 ([\d:]+)", lambda m: form.format(day("2026", "05", "01") + m[1]), path.read_text("utf-8-sig")
+    )
+    path.write_text(text)
+    assert read_telemetry(path).utc_minus_stamp_ns * 1e-9 == pytest.approx(1_777_629_600.0, abs=0.8)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "steady"), [(70, 70, True), (70, 70.3, True), (70, 30, False), (84, 60, False)]
+)
+def test_a_view_that_changes_is_no_lens(tmp_path, first, last, steady):
+    lines = write_airdata(tmp_path / "f.csv", [(1.0, 30.0)]).read_text("utf-8-sig").splitlines()
+    views = np.linspace(first, last, len(lines) - 1)
+    rows = [f"{v:.2f},{line}" for v, line in zip(views, lines[1:], strict=True)]
+    (tmp_path / "z.csv").write_text("\n".join([f"hfov,{lines[0]}", *rows]))
+    log = read_telemetry(tmp_path / "z.csv")
+    assert (log.lens is not None) == steady
+    assert any(lack.kind is Lack.ZOOM for lack in log.lacks) != steady
+
+
+@pytest.mark.parametrize("lengths", [(400, 120), (60, 400), (100, 90, 400, 30)])
+def test_the_longest_of_several_flights_in_a_table_is_used(tmp_path, lengths):
+    lines = write_airdata(tmp_path / "f.csv", [(1.0, 30.0)]).read_text("utf-8-sig").splitlines()
+    (tmp_path / "all.csv").write_text("\n".join([lines[0], *(line for n in lengths for line in lines[1 : n + 1])]))
+    log = read_telemetry(tmp_path / "all.csv")
+    alone = read_telemetry(tmp_path / "f.csv")
+    assert np.array_equal(log.track.stamp_ns, alone.track.stamp_ns[: max(lengths)])
+    assert np.allclose(log.track.gimbal, alone.track.gimbal[: max(lengths)])
+    assert any(lack.kind is Lack.SEVERAL for lack in log.lacks)
+    (tmp_path / "turned.csv").write_text("\n".join([lines[0], *lines[:0:-1]]))
+    assert np.array_equal(read_telemetry(tmp_path / "turned.csv").track.stamp_ns, alone.track.stamp_ns)

@@ -129,10 +129,27 @@ def test_gopro_videos_hold_positions(tmp_path, newer, count, capsys):
     "GPS({1:.6f},{0:.6f},16) Hb:{h:.2f} Hs:{h:.2f}",
     "GPS(N:{0:.6f}, E:{1:.6f}, {h:.2f}m)",
     "[latitude : {0:.6f}] [longtitude : {1:.6f}] [altitude: {h:.2f}]",
+    "GPS({0:.6f},{1:.6f},{h:.3f}) BAROMETER({h:.1f})",
+    "GPS({0:.6f},{1:.6f},{h:.3f}) BAROMETER:{h:.1f}",
+    "GPS({1:.6f},{0:.6f},{h:.1f}) BAROMETER({h:.1f})\nHOME(7.25,46.5) D={d:.1f}m H={h:.1f}m",
+    "GPS({0:.6f},{1:.6f},{h:.1f})\nHOME(46.5,7.25) D={d:.1f}m H={h:.1f}m",
 ])  # fmt: skip
 def test_every_form_of_a_place_is_one_orbit(tmp_path, form):
     lines = [form.format(*place, d=20.0, h=place[2] - 400) for place in PLACE]
     (tmp_path / "x.srt").write_text(srt_text(np.arange(60.0), lines))
+    assert is_the_orbit(read_telemetry(tmp_path / "x.srt").track)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("point", [".", ","])
+def test_subtitles_are_read_in_every_spelling(tmp_path, encoding, newline, point):
+    values = [[f"{v:.6f}".replace(".", point) for v in (*place[:2], place[2] - 400)] for place in PLACE]
+    lines = [
+        "2024-01-15 14:30:22,123\n[latitude: {}] [longitude: {}] [rel_alt: {} abs_alt: 1]".format(*v) for v in values
+    ]
+    text = ("\ufeff" if encoding.endswith("le") else "") + srt_text(np.arange(60.0), lines).replace("\n", newline)
+    (tmp_path / "x.srt").write_bytes(text.encode(encoding))
     assert is_the_orbit(read_telemetry(tmp_path / "x.srt").track)
 
 
@@ -154,3 +171,15 @@ def test_a_mavic_2_has_places_without_heights(tmp_path):
     (tmp_path / "air.srt").write_text(srt_text(np.arange(60.0), ["[iso : 100] [fnum : 280]"] * 60))
     with pytest.raises(InputError, match="as the Mavic Air, write none"):
         read_telemetry(tmp_path / "air.srt")
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("damage", ["<trkpt lat=", "\x00\x01&", "</gpx>", "]]>"])
+def test_points_behind_damage_of_a_gpx_are_read(tmp_path, share, damage):
+    text = gpx([PLACE[:10], PLACE])
+    at = text.index("<trkpt", int(share * len(text)))
+    (tmp_path / "x.gpx").write_text(text[:at] + damage + text[at + 60 :])
+    log = read_telemetry(tmp_path / "x.gpx#2")
+    assert 56 <= len(log.track.stamp_ns) <= 60
+    assert is_the_orbit(log.track)
+    assert any(lack.kind is Lack.DAMAGED for lack in log.lacks)

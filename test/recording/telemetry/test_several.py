@@ -152,3 +152,24 @@ def test_a_choice_of_a_log_without_several_is_refused(tmp_path):
     with pytest.raises(InputError, match="expected no choice after this log's name"):
         read_telemetry(tmp_path / "x.srt#2")
     read_telemetry(tmp_path / "x.srt")
+
+
+@pytest.mark.parametrize("step", [1, 3])
+@pytest.mark.parametrize("first", [True, False])
+def test_places_are_those_of_one_receiver(tmp_path, invented_flight, step, first):
+    t, body, geodetic, mount = invented_flight
+    path = write_dataflash_text(tmp_path / "x.log", t, body, geodetic, [(mount, 1)])
+    plain = read_telemetry(path).track.position
+    lines = []
+    for i, line in enumerate(path.read_text().splitlines()):
+        words = line.split(", ")
+        if words[0] == "FMT" and words[3] == "GPS":
+            line = line.replace("QBIHLLf", "QBBIHLLf").replace("TimeUS,Status", "TimeUS,I,Status")
+        if words[0] == "GPS":
+            own = ", ".join([*words[:2], str(int(not first)), *words[2:]])
+            far = [*words[:2], str(int(first)), *words[2:5], f"{float(words[5]) + 3e-5:.7f}", *words[6:]]
+            both = [own] + [", ".join(far)] * (i % (2 * step) == 0)
+            line = "\n".join(both if first else both[::-1])
+        lines.append(line)
+    path.write_text("\n".join(lines) + "\n")
+    assert np.nanmax(np.abs(read_telemetry(path).track.position - plain)) < 0.02

@@ -7,6 +7,7 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.vehicle import quaternion_from_euler, yaw_of
+from drocap_ros.recording.telemetry.log import Lack
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.tlog import tlog_messages
 
@@ -96,3 +97,16 @@ def _write(folder, data):
     path = folder / "cut.tlog"
     path.write_bytes(bytes(data))
     return path
+
+
+@pytest.mark.parametrize("damage", ["bits", "hole", "noise", "none", "cut"])
+def test_damage_of_a_tlog_is_told(messages, tmp_path, damage):
+    data = TLOG.read_bytes()[:300_000]
+    middle = len(data) // 2
+    data = {
+        "bits": data[:middle] + bytes(b ^ 90 for b in data[middle : middle + 900]) + data[middle + 900 :],
+        "hole": data[:middle] + bytes(2000) + data[middle:], "none": data, "cut": data[: middle + 3],
+        "noise": data[:middle] + np.random.default_rng(0).bytes(5000) + data[middle:],
+    }[damage]  # fmt: skip
+    log = read_telemetry(_write(tmp_path, data))
+    assert any(lack.kind is Lack.DAMAGED for lack in log.lacks) == (damage not in ("none", "cut"))
