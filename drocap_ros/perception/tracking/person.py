@@ -175,8 +175,7 @@ class PoseBelief:
         self.usual = 0.0
         self._limbs: np.ndarray | None = None
         self._poses = 0
-        self._support, self._established = 0.0, False
-        self.mean, self.judged = 0.0, 0
+        self._support, self._established, self.mean, self.judged = 0.0, False, 0.0, 0
         self._failing_ns: int | None = None
 
     def judge(
@@ -343,8 +342,8 @@ class Person:
     @property
     def nobody(self) -> bool:
         """Whether it is clutter that was taken for a person; poses of somebody in bad light are nearly believable."""
-        lack = self.pose.judged * (CONFIRM_CONFIDENCE - self.pose.mean)
-        return not (self.pose.established or self.plausible) and lack > _NOBODY
+        nearly = self.pose.judged * (CONFIRM_CONFIDENCE - self.pose.mean) <= _NOBODY
+        return not (self.pose.established or self.plausible or nearly)
 
     @property
     def moves(self) -> bool:
@@ -439,10 +438,10 @@ def _blend(mean: np.ndarray | None, appearance: np.ndarray, rate: float) -> np.n
 def person_at(box: np.ndarray, persons: Iterable[Person], stamp_ns: int) -> Person | None:
     """Who was detected in this image where a box (4,) px is, or inside one that somebody has drawn loosely."""
     detected = [p for p in persons if p.detected_ns == stamp_ns]
-    boxes = boxes_of(detected)
-    overlap, shared = iou(box[None].astype(float), boxes)[0], overlap_coefficient(box[None].astype(float), boxes)[0]
-    inside = (shared > _INSIDE) & (areas_of(boxes) < areas_of(box[None])) & (overlap > TOUCHES)
-    overlap[(overlap < PARTLY) & ~inside] = 0.0
+    given, boxes = box[None].astype(float), boxes_of(detected)
+    overlap = iou(given, boxes)[0]
+    inside = (overlap_coefficient(given, boxes)[0] > _INSIDE) & (areas_of(boxes) < areas_of(given))
+    overlap[(overlap < PARTLY) & ~(inside & (overlap > TOUCHES))] = 0.0
     return detected[int(overlap.argmax())] if overlap.max(initial=0.0) > 0 else None
 
 
