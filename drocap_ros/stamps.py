@@ -7,6 +7,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 
 NS = 10**9  # nanoseconds of a second
+_LEAST_STEP_NS = 400_000  # 2,500 images per second, and in microseconds 2.5
 #: Longest time from the first to the last frame, ns: a year. More is no recording, and overflows.
 _LONGEST_NS = 365 * 86_400 * NS
 #: Successive stamps of another time after which the stream has moved there: a replay began, a clock was set.
@@ -48,12 +49,15 @@ def _far(a_ns: int, b_ns: int) -> bool:
 
 
 def check_stamps(stamp_ns: np.ndarray) -> None:
-    """Refuse stamps (F,) that do not increase, or last longer than a year."""
+    """Refuse stamps (F,) that do not increase, last longer than a year, or are of no camera: of another unit."""
     first, last = int(stamp_ns[0]), int(stamp_ns[-1])
     if last - first > _LONGEST_NS:
         raise InputError(f"stamp_ns: expected nanoseconds within a year, got {first} to {last}; is the unit right?")
     if np.any(stamp_ns[1:] <= stamp_ns[:-1]):
         raise InputError("stamp_ns: expected strictly increasing times, got a repeated or earlier one; sort the frames")
+    if len(stamp_ns) > 1 and (step := float(np.median(np.diff(stamp_ns)))) < _LEAST_STEP_NS:
+        raise InputError(f"stamp_ns: expected nanoseconds, got steps of {step:g}, {1e9 / step:.3g} images per second;"
+                         " multiply microseconds by 1000, milliseconds by 1000000")  # fmt: skip
 
 
 def as_stamps(array: np.ndarray) -> np.ndarray:

@@ -139,3 +139,15 @@ def test_poses_in_space_are_no_keypoints(tmp_path, unit, columns):
     np.savez(tmp_path / "t.npz", **{**arrays(20), "keypoints": points[..., :columns]})
     with pytest.raises(InputError, match="3D poses" if columns == 3 else "expected px of an image of 640x480"):
         load_tracks(tmp_path / "t.npz")
+
+
+@pytest.mark.parametrize("rate_hz", [5, 24, 60, 240, 1000])
+@pytest.mark.parametrize(("unit", "right"), [(1, True), (1000, False), (1_000_000, False)])
+def test_times_in_another_unit_than_nanoseconds_are_refused(tmp_path, rate_hz, unit, right):
+    stamp_ns = 10**15 + np.arange(40) * (10**9 // rate_hz)
+    np.savez(tmp_path / "t.npz", **{**arrays(40), "stamp_ns": stamp_ns // unit})
+    if right:
+        assert len(load_tracks(tmp_path / "t.npz")) == 40
+        return
+    with pytest.raises(InputError, match="nanoseconds|increasing"):
+        load_tracks(tmp_path / "t.npz")
