@@ -38,7 +38,7 @@ BUDGETS = {
     # several in a log; damaged recordings, packed messages, journals, lenses of others (0.1)
     ("simulation",): 2.92,  # reports err as recorded ones
     ("evaluation",): 1.11,  # truth from C3D, TRC and BVH by the names of other programs (0.38), one of several bodies
-    ("export", "report", "view"): 4.77,  # OpenSim, USD and FBX (0.17), an avatar's bones live (0.29), several persons
+    ("export", "report", "view"): 4.78,  # OpenSim, USD and FBX (0.17), an avatar's bones live (0.29), several persons
     ("app",): 1.42,  # the page of clips, corrections and exports
     ("station",): 0.75,  # one page in a browser for the flight
     ("ros", "nodes", "bringup"): 5.10,  # lockstep, processes of their own; networks beside optical flow, shared images

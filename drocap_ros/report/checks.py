@@ -73,6 +73,11 @@ class MotionCheck(Enum):
         # Images per second: below the first errors grow, at the second by half, at 5 threefold.
         (20.0, 12.5),
     )
+    GAP = (
+        "Gap in time",
+        "No image for {gap:.0f} s after {at:.1f} s: these are two recordings. Cut there: `--start`, `--end`.",
+        (5.0,),  # s
+    )
     HIGH_ERROR = (
         "High reprojection error",
         "Half of the joints project more than {px:.1f} px from their keypoints, {share:.1%} of the body's size in the"
@@ -166,6 +171,7 @@ class Finding:
 
 #: Checks that alone make a motion doubtful.
 _DOUBTFUL = (
+    MotionCheck.GAP,
     MotionCheck.NO_BODY,
     MotionCheck.MIRRORED,
     MotionCheck.MISFIT,
@@ -231,6 +237,9 @@ def _of_view(motion: Motion, s: Statistics) -> Iterator[Finding]:
     if s.elevation_deg > high:
         level = _warn if s.elevation_deg > steep else _note
         yield level(MotionCheck.STEEP_VIEW, elevation=s.elevation_deg, limit=high)
+    gaps = np.append(np.diff(s.times_s), 0.0)
+    if (gap := float(gaps.max())) > MotionCheck.GAP.limits[0]:
+        yield _warn(MotionCheck.GAP, gap=gap, at=float(s.times_s[gaps.argmax()]))
     few, low = MotionCheck.LOW_RATE.limits
     if 0.0 < s.rate_hz < few:
         level = _warn if s.rate_hz < low else _note

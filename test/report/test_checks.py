@@ -137,6 +137,17 @@ def test_low_image_rate_is_named(person, rate_hz, level):
     assert level is None or f"{rate_hz:.1f} images per second" in found[0].text
 
 
+@pytest.mark.parametrize("gap_s", [0.5, 4.0, 6.0, 60.0, 3600.0])
+@pytest.mark.parametrize("at", [1, 10, -1])
+def test_gap_in_time_makes_a_motion_doubtful(person, gap_s, at):
+    stamps = np.arange(len(person.stamp_ns), dtype=np.int64) * 40_000_000
+    stamps[at:] += round(gap_s * 1e9)
+    found = results(dataclasses.replace(person, stamp_ns=stamps))
+    named = [r for r in found if r.check is MotionCheck.GAP]
+    assert bool(named) == (gap_s > 5.0)
+    assert not named or f"No image for {gap_s:.0f} s" in named[0].text
+
+
 def test_interpolated_poses_before_the_person_comes_count_in_no_statistic(reported_in_camera):
     """Two thirds of the frames repeat the first pose, with its knees bent backward and a longer shank."""
     person, first = reported_in_camera, 2 * len(reported_in_camera.joints3d)
