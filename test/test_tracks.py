@@ -149,5 +149,5 @@ def test_times_in_another_unit_than_nanoseconds_are_refused(tmp_path, rate_hz, u
     if right:
         assert len(load_tracks(tmp_path / "t.npz")) == 40
         return
-    with pytest.raises(InputError, match="nanoseconds|increasing"):
+    with pytest.raises(InputError, match=r"nanoseconds|increasing"):
         load_tracks(tmp_path / "t.npz")
