@@ -60,7 +60,7 @@ class LoopSettings:
         describe it
     camera_pitch_deg : of the camera, negative = down; NaN = aimed at the middle of the person
     field_deg : width of the camera's field of view
-    timeout_s, estimate_error, attitude_error_deg, yaw_error_deg : as :class:`CopterSetup`
+    timeout_s, estimate_error, attitude_error_deg, yaw_error_deg, gyro_error : as :class:`CopterSetup`
     """
 
     autopilot: str = "ardupilot"
@@ -89,6 +89,7 @@ class LoopSettings:
     estimate_error: float = 1.0
     attitude_error_deg: float = 0.4
     yaw_error_deg: float = 0.0
+    gyro_error: float = 1.0
     config: MavlinkBridgeConfig = field(
         default_factory=lambda: MavlinkBridgeConfig(
             commands_enabled=True, mode_change_allowed=True, attitude_hz=25.0, position_hz=20.0
@@ -165,6 +166,7 @@ class OrbitLoop:
                 estimate_error=settings.estimate_error,
                 attitude_error_deg=settings.attitude_error_deg,
                 yaw_error_deg=settings.yaw_error_deg,
+                gyro_error=settings.gyro_error,
                 timeout_s=settings.timeout_s,
                 mode=settings.start_mode or autopilot_of(settings.autopilot).handed_over_mode,
                 mount=SimulatedMount(settings.mount, settings.camera_pitch_deg),

@@ -92,7 +92,9 @@ class Observer:
             state = dataclasses.replace(state, velocity_enu_m_s=self._filter.velocity)
         self.vehicle = state
         self._history.add(state, self._filter.position)
-        self._subject.height_wanders = autopilot_of(state.autopilot).height_wanders
+        autopilot = autopilot_of(state.autopilot)
+        self._subject.height_wanders = autopilot.height_wanders
+        self._subject.heading_sd = math.radians(max(autopilot.heading_sd_deg, self._config.attitude_error_deg))
         self._locate()
 
     def on_camera(self, camera_matrix: np.ndarray) -> None:
@@ -271,6 +273,7 @@ def _subject(estimate: SubjectEstimate, offset: np.ndarray, motion: Motion, by_s
         contradicted=estimate.contradicted or (by_size is not None and by_size.contradicted),
         sd_m=estimate.position_sd_m,
         nearer=estimate.nearer,
+        heading_error=estimate.heading_error,
         ground=Height(estimate.ground.m + float(offset[2]), estimate.ground.sd_m),
         distance_m=distance if by_size is None else min(distance, by_size.farthest_m),
         closing_m_s=-float(sight @ motion.velocity[:2]) / max(distance, 1e-3),
