@@ -48,7 +48,7 @@ _NEVER = math.inf
 #: again : whether the operator starts again what has ended
 VALUES: dict[str, tuple[Any, ...]] = {
     "seed": (0, [0]), "autopilot": ("ardupilot", ["px4"]),
-    "wind_m_s": (0.0, 0.0, 14.0), "bearing_deg": (0.0, -180.0, 180.0), "distance_m": (7.0, 2.0, 25.0),
+    "wind_m_s": (0.0, 0.0, 10.0), "bearing_deg": (0.0, -180.0, 180.0), "distance_m": (7.0, 2.0, 25.0),
     "start_height_m": (3.0, 1.7, 6.0), "mount": ("gimbal", ["servo", "fixed"]), "field_deg": (60.0, 50.0, 100.0),
     "stature_m": (1.75, 0.9, 2.0), "fence_radius_m": (40.0, 8.0, 20.0), "radius_m": (6.0, 3.8, 10.0),
     "height_m": (2.5, 1.8, 5.0), "angular_speed_deg_s": (19.0, -25.0, 25.0), "body_height_m": (1.7, 1.2, 2.1),

@@ -21,7 +21,7 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.commands import TELEMETRY_COMMANDS, Message, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.guardian import PACKETS
 from drocap_ros.flight.mavlink.parser import MavlinkParser, Packer, read_signing_key
-from drocap_ros.flight.mavlink.reports import Mount
+from drocap_ros.flight.mavlink.reports import Mount, is_autopilots
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.mavlink.telemetry_request import AutopilotSettings, LinkStatus, TelemetryRequests
 from drocap_ros.flight.mavlink.transport import LinkError, Transport, open_transport
@@ -250,7 +250,7 @@ class MavlinkLink:
         self._requests.count(message.get_msgId(), now_ns)
         # A gimbal, a camera or another companion of this vehicle answers for itself alone, and may have its own port.
         if message.get_srcComponent() == self.estimator.component_id:
-            if name == "HEARTBEAT":
+            if name == "HEARTBEAT" and is_autopilots(message):
                 self._transport.accept_peer()
             self._take_answer(name, message, now_ns)
         return state
