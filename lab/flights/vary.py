@@ -125,6 +125,7 @@ class Watch:
         self._ended_s = self._pilot_s = _NEVER  # since when nothing may move; last choice of the pilot
         self._ours_s, self._inherited = _NEVER, (0.0, 0.0, 0.0)  # since when the mode is ours; what was flown then
         self._near_m, self._centre, self._modes = 0.0, loop.pelvis()[:2], 1
+        self._apart_m = _NEVER
         self._write, loop.up.write = loop.up.write, self._sent  # type: ignore[method-assign]
 
     def command(self, kind: Command, **values: float) -> None:
@@ -154,7 +155,9 @@ class Watch:
         self._note(_SPEED, own[0])
         self._note(_CLOSING, own[1] - 4.0 * max(0.0, *(a - b for a, b in itertools.pairwise(fled))))
         self._note(_DESCENT, min(1.2, self._inherited[2]) - flown[2])
-        if np.hypot(*sight) < loop.settings.config.min_distance_m:
+        # One who runs past a vehicle that gives way has its last metre behind him: he is farther with every step.
+        before_m, self._apart_m = self._apart_m, float(np.hypot(*sight))
+        if self._apart_m < min(loop.settings.config.min_distance_m, before_m):
             self._near_m += max(own[1], 0.0) / loop.settings.config.control_hz
             self._note(_NEARER, self._near_m)
         away = body.position[:2] - self._centre
