@@ -23,7 +23,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.parser import CurrentMode
-from drocap_ros.flight.orbit.states import Command, State
+from drocap_ros.flight.orbit.states import Action, Command, State
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target, manner_of
 from drocap_ros.simulation.vehicle.loopback import is_setpoint
 from lab.flights.branches import over_processes
@@ -154,7 +154,9 @@ class Watch:
         fled = [loop.pelvis(max(t - ago, 0.0))[:2] @ toward for ago in (0.0, 0.25, 0.5, 0.75, 1.0)]
         self._note(_SPEED, own[0])
         self._note(_CLOSING, own[1] - 4.0 * max(0.0, *(a - b for a, b in itertools.pairwise(fled))))
-        self._note(_DESCENT, min(1.2, self._inherited[2]) - flown[2])
+        # By a height whose error grows the autopilot sinks in every hold, its own too: then the orbit alone counts.
+        if not self.drawn.height_drift_m_s or (loop.rows and loop.rows[-1].action == Action.ORBIT):
+            self._note(_DESCENT, min(1.2, self._inherited[2]) - flown[2])
         # One who runs past a vehicle that gives way has its last metre behind him: he is farther with every step.
         before_m, self._apart_m = self._apart_m, float(np.hypot(*sight))
         if self._apart_m < min(loop.settings.config.min_distance_m, before_m):
