@@ -145,6 +145,7 @@ class Subject:
     contradicted : whether images since he was located showed something else in his place
     nearer : share of his distance by which the nearer of body size and ground puts him nearer
     ground : his ground by his body alone, which the reported height has no part in
+    heading_error : rad, of the vehicle, reported less true, as the pictures of him show it
     distance_m : horizontal
     closing_m_s, approach_m_s : speed of the vehicle towards him, and of him towards the vehicle
     approach_sd_m_s : standard deviation of ``approach_m_s``
@@ -158,6 +159,7 @@ class Subject:
     sd_m: float = math.inf
     nearer: float = 0.0
     ground: Height = NO_HEIGHT
+    heading_error: float = 0.0
     distance_m: float = math.nan
     closing_m_s: float = 0.0
     approach_m_s: float = 0.0

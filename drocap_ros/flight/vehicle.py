@@ -153,10 +153,11 @@ class VehicleState:
 
 
 class CameraPose(NamedTuple):
-    """(3, 3) world ENU -> optical, and (3,) m ENU."""
+    """(3, 3) world ENU -> optical, (3,) m ENU, and rad by which the heading has turned beyond the gyroscope's rates."""
 
     rotation: np.ndarray
     position: np.ndarray
+    turned: float = 0.0
 
 
 class PoseHistory:
@@ -167,7 +168,9 @@ class PoseHistory:
 
     def __init__(self, keep_s: float = 3.0) -> None:
         self._keep_ns = int(keep_s * NS)
-        self._poses: deque[tuple[int, np.ndarray, np.ndarray]] = deque()
+        self._poses: deque[tuple[int, np.ndarray, np.ndarray, float]] = deque()
+        self._turning = (0, math.nan, math.nan)  # stamp, heading, its rate by the gyroscope
+        self._turned = 0.0
         #: (3,) m, reported minus filtered position now: add it to a position from here.
         self.offset: np.ndarray = np.zeros(3)
 
@@ -177,14 +180,25 @@ class PoseHistory:
         place : (3,) m, its filtered position
         """
         camera = state.gimbal_orientation_xyzw
+        self._turn(state)
         if not (np.isfinite(camera).all() and np.isfinite(state.position_enu_m).all()):
             return
         if self._poses and state.stamp_ns <= self._poses[-1][0]:
             self._poses.clear()
         self.offset = state.position_enu_m - place
-        self._poses.append((state.stamp_ns, camera, place))
+        self._poses.append((state.stamp_ns, camera, place, self._turned))
         while state.stamp_ns - self._poses[0][0] > self._keep_ns:
             self._poses.popleft()
+
+    def _turn(self, state: VehicleState) -> None:
+        """Add what the heading has turned beyond the gyroscope's rates; after a gap, or without rates, nothing."""
+        nose, rates = matrix_from_quaternion(state.orientation_xyzw), state.angular_velocity_flu_rad_s
+        before_ns, before, rate_before = self._turning
+        heading, rate = math.atan2(nose[1, 0], nose[0, 0]), float(nose[2] @ rates) if np.any(rates) else math.nan
+        gap_s, self._turning = (state.stamp_ns - before_ns) / NS, (state.stamp_ns, heading, rate)
+        turned = math.remainder(heading - before, 2 * math.pi) - 0.5 * gap_s * (rate_before + rate)
+        if 0.0 < gap_s <= _LONGEST_GAP_S and math.isfinite(turned):
+            self._turned += turned
 
     def reached(self, stamp_ns: int) -> bool:
         """Whether a state of this instant or a later one is known."""
@@ -199,7 +213,8 @@ class PoseHistory:
             if pose[0] <= stamp_ns:
                 part = (stamp_ns - pose[0]) / max(later[0] - pose[0], 1)
                 position = (1 - part) * pose[2] + part * later[2]
-                return CameraPose(camera_rotation(slerp(pose[1], later[1], part)), position)
+                turned = (1 - part) * pose[3] + part * later[3]
+                return CameraPose(camera_rotation(slerp(pose[1], later[1], part)), position, turned)
             later = pose
         return None
 

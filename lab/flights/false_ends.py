@@ -90,13 +90,19 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=1.0, help="of flight")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--wind", type=float, default=0.0, help="m/s")
+    parser.add_argument("--load", type=float, default=0.0, help="processes that want to run beside the bridge")
     parser.add_argument("--mount", default="gimbal", choices=("gimbal", "servo", "fixed"))
     args = parser.parse_args()
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     flights: list[Flight] = []
     for seed in range(args.first, args.first + math.ceil(args.hours * 3600 / FLIGHT_S)):
         settings = LoopSettings(
-            autopilot=args.autopilot, seed=seed, wind_m_s=(args.wind, 0.0, 0.0), mount=args.mount, seconds=FLIGHT_S
+            autopilot=args.autopilot,
+            seed=seed,
+            wind_m_s=(args.wind, 0.0, 0.0),
+            mount=args.mount,
+            seconds=FLIGHT_S,
+            load=args.load,
         )
         flight = fly(settings)
         flights.append(flight)

@@ -23,7 +23,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.parser import CurrentMode
-from drocap_ros.flight.orbit.states import Command, State
+from drocap_ros.flight.orbit.states import Action, Command, State
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target, manner_of
 from drocap_ros.simulation.vehicle.loopback import is_setpoint
 from lab.flights.branches import over_processes
@@ -41,26 +41,32 @@ _NEVER = math.inf
 #: takes_s, gives_s : when the pilot takes over, and for how long
 #: mode_s, attitude_s, position_s, mount_s, status_s : least time between two messages of a kind
 #: person_m_s, person_deg, until_s : how the person moves, and until when; 0 deg = at the vehicle, all the time
+#: flips_s : period of a pilot's switch between his mode and control, from 8 s on
 #: blind_s, stop_s : when the pictures end, and when the operator stops
+#: jump_m, clock_drift : of the reported position at 9 s, to the person; of the autopilot's clock, a share
+#: load : as of :class:`LoopSettings`
 #: again : whether the operator starts again what has ended
 VALUES: dict[str, tuple[Any, ...]] = {
     "seed": (0, [0]), "autopilot": ("ardupilot", ["px4"]),
-    "wind_m_s": (0.0, 0.0, 10.0), "bearing_deg": (0.0, -180.0, 180.0), "distance_m": (7.0, 3.6, 14.0),
+    "wind_m_s": (0.0, 0.0, 10.0), "bearing_deg": (0.0, -180.0, 180.0), "distance_m": (7.0, 2.0, 25.0),
     "start_height_m": (3.0, 1.7, 6.0), "mount": ("gimbal", ["servo", "fixed"]), "field_deg": (60.0, 50.0, 100.0),
     "stature_m": (1.75, 0.9, 2.0), "fence_radius_m": (40.0, 8.0, 20.0), "radius_m": (6.0, 3.8, 10.0),
     "height_m": (2.5, 1.8, 5.0), "angular_speed_deg_s": (19.0, -25.0, 25.0), "body_height_m": (1.7, 1.2, 2.1),
     "size_error": (0.08, 0.04, 0.12), "use_ground_plane": (True, [False]), "timeout_s": (0.5, 0.3, 0.5),
     "control_hz": (20.0, 10.0, 40.0), "height_error_m": (0.0, -5.0, 5.0),
-    "estimate_error": (1.0, 0.0, 5.0), "attitude_error_deg": (0.4, 0.0, 2.0), "yaw_error_deg": (0.0, 0.0, 10.0),
-    "down_delay_s": (0.01, 0.0, 0.3), "up_delay_s": (0.01, 0.0, 0.3), "jitter_s": (0.0, 0.0, 0.1),
-    "loss": (0.0, 0.0, 0.3), "gaps_hz": (0.0, 0.0, 2.0), "mode_s": (0.0, 0.05, 1.0), "attitude_s": (0.0, 0.02, 0.2),
+    "estimate_error": (1.0, 0.0, 5.0), "attitude_error_deg": (0.4, 0.0, 3.0), "yaw_error_deg": (0.0, 0.0, 30.0),
+    "down_delay_s": (0.01, 0.0, 0.35), "up_delay_s": (0.01, 0.0, 0.35), "jitter_s": (0.0, 0.0, 0.1),
+    "loss": (0.0, 0.0, 0.3), "gaps_hz": (0.0, 0.0, 2.0), "mode_s": (0.0, 0.05, 5.0), "attitude_s": (0.0, 0.02, 0.2),
     "position_s": (0.0, 0.03, 0.2), "mount_s": (0.0, 0.05, 0.3), "status_s": (0.0, 0.2, 1.5),
-    "perception_hz": (15.0, 5.0, 30.0), "latency_s": (0.1, 0.03, 0.4), "late_share": (0.0, 0.0, 0.5),
+    "perception_hz": (15.0, 5.0, 30.0), "latency_s": (0.1, 0.03, 0.5), "late_share": (0.0, 0.0, 0.5),
     "stamp_late_s": (0.0, -0.1, 0.35), "clock_step_s": (0.0, -3.0, 3.0), "pilot_m_s": (0.0, 0.5, 5.0),
     "pilot_deg": (0.0, -180.0, 180.0), "grant_s": (0.0, 0.0, 5.0), "takes_s": (_NEVER, 4.1, 14.0),
     "gives_s": (_NEVER, 0.1, 4.0), "person_m_s": (0.0, 0.3, 5.0), "person_deg": (180.0, -180.0, 180.0),
     "until_s": (_NEVER, 8.0, 16.0), "blind_s": (_NEVER, 6.0, 16.0), "stop_s": (_NEVER, 4.0, 16.0),
-    "adjust_m": (0.0, 3.5, 12.0), "again": (False, [True]),
+    "adjust_m": (0.0, 3.5, 12.0), "again": (False, [True]), "late_s": (0.3, 0.1, 1.5), "duplicate": (0.0, 0.0, 0.3),
+    "clock_drift": (0.0, -0.03, 0.03), "jump_m": (0.0, -5.0, 5.0), "flips_s": (_NEVER, 0.3, 2.0),
+    "action": ("stand", ["squats", "boxing", "kicking"]), "load": (0.0, 0.0, 20.0), "gyro_error": (1.0, 0.0, 5.0),
+    "height_drift_m_s": (0.0, -0.5, 0.5), "gimbal_control": (False, [True]), "max_coast_m": (3.0, 1.0, 5.0),
 }  # fmt: skip
 
 
@@ -119,6 +125,7 @@ class Watch:
         self._ended_s = self._pilot_s = _NEVER  # since when nothing may move; last choice of the pilot
         self._ours_s, self._inherited = _NEVER, (0.0, 0.0, 0.0)  # since when the mode is ours; what was flown then
         self._near_m, self._centre, self._modes = 0.0, loop.pelvis()[:2], 1
+        self._apart_m = _NEVER
         self._write, loop.up.write = loop.up.write, self._sent  # type: ignore[method-assign]
 
     def command(self, kind: Command, **values: float) -> None:
@@ -147,8 +154,12 @@ class Watch:
         fled = [loop.pelvis(max(t - ago, 0.0))[:2] @ toward for ago in (0.0, 0.25, 0.5, 0.75, 1.0)]
         self._note(_SPEED, own[0])
         self._note(_CLOSING, own[1] - 4.0 * max(0.0, *(a - b for a, b in itertools.pairwise(fled))))
-        self._note(_DESCENT, min(1.2, self._inherited[2]) - flown[2])
-        if np.hypot(*sight) < loop.settings.config.min_distance_m:
+        # By a height whose error grows the autopilot sinks in every hold, its own too: then the orbit alone counts.
+        if not self.drawn.height_drift_m_s or (loop.rows and loop.rows[-1].action == Action.ORBIT):
+            self._note(_DESCENT, min(1.2, self._inherited[2]) - flown[2])
+        # One who runs past a vehicle that gives way has its last metre behind him: he is farther with every step.
+        before_m, self._apart_m = self._apart_m, float(np.hypot(*sight))
+        if self._apart_m < min(loop.settings.config.min_distance_m, before_m):
             self._near_m += max(own[1], 0.0) / loop.settings.config.control_hz
             self._note(_NEARER, self._near_m)
         away = body.position[:2] - self._centre
@@ -172,7 +183,9 @@ class Watch:
             if by == "pilot":
                 self._pilot_s = _NEVER if mode == loop.copter.kind.control_mode else at_s
             elif by == "command" and self._begun_s < self._pilot_s < _NEVER:
-                self._note(_PILOT, at_s - self._pilot_s - self._late_s(up=True))
+                self._note(_PILOT, late_s := at_s - self._pilot_s - self._late_s(up=True))
+                # A choice that the bridge could not know when it asked for the mode is overridden, and never heard of.
+                self._pilot_s = _NEVER if late_s <= 0.0 else self._pilot_s
         self._modes = len(loop.copter.mode_log)
 
     def _late_s(self, *, up: bool = False) -> float:
@@ -224,9 +237,9 @@ def settings_of(drawn: Draw) -> LoopSettings:
         {name: getattr(drawn, name) for name in names} for names in (
             ("autopilot", "seed", "bearing_deg", "distance_m", "mount", "field_deg", "stature_m", "timeout_s",
              "perception_hz", "latency_s", "late_share", "stamp_late_s", "gaps_hz", "estimate_error",
-             "attitude_error_deg", "yaw_error_deg"),
+             "attitude_error_deg", "yaw_error_deg", "gyro_error", "late_s", "action", "load"),
             ("radius_m", "height_m", "angular_speed_deg_s", "body_height_m", "size_error", "use_ground_plane",
-             "control_hz"),
+             "control_hz", "gimbal_control", "max_coast_m"),
         )
     )  # fmt: skip
     wind = drawn.wind_m_s * math.cos(drawn.seed), drawn.wind_m_s * math.sin(drawn.seed), 0.0
@@ -243,9 +256,12 @@ class _Flight:
         self.watch = Watch(loop, drawn)
         loop.down.delay_s, loop.up.delay_s, loop.down.jitter_s = d.down_delay_s, d.up_delay_s, d.jitter_s
         loop.down.loss = loop.up.loss = d.loss
+        loop.down.duplicate = loop.up.duplicate = d.duplicate
         loop.down.drops = _slow(loop, d)
         copter = loop.copter
         copter.gps_error = copter.gps_error + np.array([0.0, 0.0, d.height_error_m])
+        clock_s = copter.clock_s
+        copter.clock_s = lambda t_s: clock_s((1.0 + d.clock_drift) * t_s)  # type: ignore[method-assign]
         copter.control.begin(manner_of(copter.kind, copter.mode), copter.estimate, np.zeros(3), copter.body.yaw)
         self._enter = copter.set_mode
         copter.set_mode = self._set_mode  # type: ignore[method-assign]
@@ -257,8 +273,11 @@ class _Flight:
             (d.stop_s, partial(command, Command.STOP)),
             (12.0 if d.adjust_m else _NEVER, partial(command, Command.ADJUST, radius_m=d.adjust_m)),
             (d.blind_s, partial(setattr, loop, "perceive", lambda seen: None)),
-            (10.0, partial(setattr, loop, "clock_jump_s", d.clock_step_s)),
+            (10.0, partial(setattr, loop, "clock_jump_s", d.clock_step_s)), (9.0, partial(self._err, d.jump_m, 0.0)),
         ]  # fmt: skip
+        for i in range(math.ceil(8.0 / d.flips_s)):
+            mode = copter.kind.control_mode if i % 2 else copter.simulated.stick_mode
+            self._plan.append((8.0 + i * d.flips_s, partial(copter.set_mode, mode, "pilot")))
         self._heading: np.ndarray | None = None
         self._waits_s, self._granted_s = START_S, _NEVER
 
@@ -271,6 +290,8 @@ class _Flight:
             self._granted_s = _NEVER
             self._enter(loop.copter.kind.control_mode, "command")
         self._walk()
+        if self.drawn.height_drift_m_s and loop.t > START_S + 2.0:
+            self._err(0.0, self.drawn.height_drift_m_s / loop.settings.config.control_hz)
         if loop.controller.safety.state == State.ORBITING or not self.drawn.again:
             self._waits_s = loop.t
         elif loop.t - self._waits_s > 3.0:
@@ -285,6 +306,11 @@ class _Flight:
             return
         self._granted_s = _NEVER
         self._enter(mode, by)
+
+    def _err(self, toward_m: float, up_m: float) -> None:
+        """The reported position moves, to the person and up."""
+        copter = self.loop.copter
+        copter.gps_error = copter.gps_error + np.array([*toward_m * self._towards(-1.0, 0.0), up_m])
 
     def _start(self) -> None:
         control = self.loop.copter.mode == self.loop.copter.kind.control_mode

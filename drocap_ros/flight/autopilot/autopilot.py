@@ -245,6 +245,7 @@ class Autopilot:
     integers_in_bytes : whether an integer parameter has its bytes in the field of the float
     velocity_sd_m_s : of its reported velocity, until a flight has shown it
     height_wanders : whether the reported height wanders by decimetres within seconds
+    heading_sd_deg : of its reported heading, where it errs by more than its attitude
 
     Flight by setpoints, and without them
 
@@ -288,6 +289,7 @@ class Autopilot:
     integers_in_bytes: bool = False
     velocity_sd_m_s: float = 0.1
     height_wanders: bool = False
+    heading_sd_deg: float = 0.0
 
     position_gain_per_s: float = 1.0
     continues_setpoints: bool = False

@@ -66,6 +66,7 @@ PX4 = Autopilot(
     integers_in_bytes=True,
     velocity_sd_m_s=0.25,  # recorded, as errors for seconds
     height_wanders=True,  # by 0.2 to 0.45 m in recorded flights
+    heading_sd_deg=6.0,  # recorded: 4 to 19 at worst, within 10 to 60 s
     position_gain_per_s=0.95,  # MPC_XY_P
     timeout_setting="COM_OF_LOSS_T",
     shipped_timeout_s=1.0,

@@ -21,7 +21,7 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.commands import TELEMETRY_COMMANDS, Message, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.guardian import PACKETS
 from drocap_ros.flight.mavlink.parser import MavlinkParser, Packer, read_signing_key
-from drocap_ros.flight.mavlink.reports import Mount
+from drocap_ros.flight.mavlink.reports import Mount, is_autopilots
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.mavlink.telemetry_request import AutopilotSettings, LinkStatus, TelemetryRequests
 from drocap_ros.flight.mavlink.transport import LinkError, Transport, open_transport
@@ -70,6 +70,7 @@ class MavlinkLink:
         self._heard_s: float | None = None  # monotonic
         self._due: dict[str, float] = {}
         self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
+        self._spun_s = math.inf  # when it was read last, monotonic
         self._answered_s = math.nan  # when the message was sent that was answered last, monotonic
         # 1.6 s of them at the greatest control_hz: no echo is awaited for longer.
         self._sent: deque[tuple[float, Message]] = deque(maxlen=80)  # monotonic s
@@ -98,6 +99,9 @@ class MavlinkLink:
     def spin_once(self, timeout_s: float = 0.0) -> list[VehicleState]:
         """Read for at most ``timeout_s``, then send what is due: one state per attitude message.  No input raises."""
         data = self._read(timeout_s)
+        before_s, self._spun_s = self._spun_s, self._monotonic_s()
+        if self._spun_s - before_s > self.config.watchdog_s:
+            self._answered_s += self._spun_s - before_s  # meanwhile we have asked nothing
         now_ns = self._clock_ns()
         with self._lock:
             states = [self._take(message, now_ns) for message in (self._parser.feed(data) if data else [])]
@@ -246,7 +250,7 @@ class MavlinkLink:
         self._requests.count(message.get_msgId(), now_ns)
         # A gimbal, a camera or another companion of this vehicle answers for itself alone, and may have its own port.
         if message.get_srcComponent() == self.estimator.component_id:
-            if name == "HEARTBEAT":
+            if name == "HEARTBEAT" and is_autopilots(message):
                 self._transport.accept_peer()
             self._take_answer(name, message, now_ns)
         return state

@@ -182,6 +182,11 @@ class PacketOrder:
         return False
 
 
+def is_autopilots(heartbeat: Message) -> bool:
+    """Whether an autopilot has sent it, and no other program, whatever system and component that one names."""
+    return bool(heartbeat.autopilot != mavlink.MAV_AUTOPILOT_INVALID and heartbeat.type != mavlink.MAV_TYPE_GCS)
+
+
 class ModeReports:
     """The mode of one vehicle.
 

@@ -12,7 +12,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.mavlink.commands import Message
-from drocap_ros.flight.mavlink.reports import MAX_LOSS, MESSAGES, ModeReports, Mount, PacketOrder, finite_quaternion
+from drocap_ros.flight.mavlink.reports import (
+    MAX_LOSS,
+    MESSAGES,
+    ModeReports,
+    Mount,
+    PacketOrder,
+    finite_quaternion,
+    is_autopilots,
+)
 from drocap_ros.flight.vehicle import (
     LANDED_ON_GROUND,
     VehicleState,
@@ -268,7 +276,7 @@ class VehicleStateEstimator:
         return flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION) and not flags & bad
 
     def _take_heartbeat(self, message: Message, now_ns: int) -> None:
-        if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.type == mavlink.MAV_TYPE_GCS:
+        if not is_autopilots(message):
             return
         system = message.get_srcSystem()
         self.systems |= {system}

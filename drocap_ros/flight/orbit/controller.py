@@ -262,7 +262,8 @@ class OrbitController:
             sight, drift = vehicle.position[:2] - subject[:2], vehicle.velocity[:2] - seen.subject.velocity[:2]
             omega = math.degrees((sight[0] * drift[1] - sight[1] * drift[0]) / max(float(sight @ sight), 0.01))
             bearing = math.atan2(-sight[1], -sight[0])
-            yaw_error = math.degrees(math.remainder(vehicle.yaw - bearing, 2 * math.pi)) if sight.any() else math.nan
+            off = vehicle.yaw - seen.subject.heading_error - bearing
+            yaw_error = math.degrees(math.remainder(off, 2 * math.pi)) if sight.any() else math.nan
         orbiting, present = self.safety.state == State.ORBITING, self.safety.condition
         distance_m = seen.subject.distance_m
         return ControlStatus(

@@ -46,10 +46,12 @@ class Following:
     """Judges an orbit step by step.
 
     max_echo_age_s : time without any echo after which the setpoints count as not followed
+    watchdog_s : time between two steps after which others hold the vehicle
     """
 
-    def __init__(self, max_echo_age_s: float) -> None:
-        self._max_echo_age_s = max_echo_age_s
+    def __init__(self, max_echo_age_s: float, watchdog_s: float) -> None:
+        self._max_echo_age_s, self._watchdog_s = max_echo_age_s, watchdog_s
+        self._stepped_s = self._stood_s = -math.inf
         self._matched_s = math.nan  # when an echo last agreed in this orbit
         self._by_speed, self._by_way = _Standing(*_BY_SPEED), _Standing(*_BY_WAY)
 
@@ -64,7 +66,9 @@ class Following:
             self._by_speed.clear()
             self._by_way.clear()
             return ""
-        autopilot = autopilot_of(vehicle.autopilot)
+        if now_s - self._stepped_s > self._watchdog_s:  # the echo is that of a hold that others have sent
+            self._stood_s = now_s
+        self._stepped_s, autopilot = now_s, autopilot_of(vehicle.autopilot)
         evidence = self._by_echo(now_s, orbiting_s, echoes, autopilot)
         return evidence or self._by_motion(now_s, echoes.sent[-1][1], vehicle, autopilot.position_gain_per_s)
 
@@ -79,6 +83,8 @@ class Following:
         followed = [message for at_s, message in sent if now_s - at_s <= oldest_s]
         if _agrees(target, followed, autopilot):
             self._matched_s = now_s
+        elif now_s - self._stood_s < _ECHOED_S:
+            return ""
         elif self._matched_s == self._matched_s and _stands(target) and not any(map(_stands, followed)):
             return "the autopilot has stopped by its time-out, without setpoints"
         # NaN: its content has not agreed yet, and is not judged.

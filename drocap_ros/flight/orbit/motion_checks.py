@@ -37,7 +37,8 @@ def vehicle_condition(seen: Observed, config: MavlinkBridgeConfig, *, patient: b
     """
     if not config.commands_enabled:
         return condition(_C.COMMANDS_DISABLED)
-    oldest_s = oldest_state_s(config, patient=patient)
+    # What has come while our own loop stood waits to be read.
+    oldest_s = oldest_state_s(config, patient=patient) + (seen.stalled_s if patient else 0.0)
     silent = 0.0 < config.operator_timeout_s < seen.operator_age_s
     return (
         seen.disturbance

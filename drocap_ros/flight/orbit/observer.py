@@ -76,7 +76,7 @@ class Observer:
         self._filter, self._doubt = VehicleFilter(UNKNOWN.velocity_sd_m_s), Doubt()
         self._history, self._pictures = PoseHistory(), PictureWatch()
         self._subject, self._guard = SubjectFilter(config), Guard(config)
-        self._following, self._keeping = Following(config.max_echo_age_s), Keeping(config)
+        self._following, self._keeping = Following(config.max_echo_age_s, config.watchdog_s), Keeping(config)
         # Pictures wait for the camera's attitude: half a second at 30 Hz, older than any that is flown by.
         self._waiting: deque[tuple[PoseObservation, bool]] = deque(maxlen=16)
         self._before: tuple[int, float] | None = None  # stamp and monotonic time of the last step
@@ -92,7 +92,9 @@ class Observer:
             state = dataclasses.replace(state, velocity_enu_m_s=self._filter.velocity)
         self.vehicle = state
         self._history.add(state, self._filter.position)
-        self._subject.height_wanders = autopilot_of(state.autopilot).height_wanders
+        autopilot = autopilot_of(state.autopilot)
+        self._subject.height_wanders = autopilot.height_wanders
+        self._subject.heading_sd = math.radians(max(autopilot.heading_sd_deg, self._config.attitude_error_deg))
         self._locate()
 
     def on_camera(self, camera_matrix: np.ndarray) -> None:
@@ -164,7 +166,9 @@ class Observer:
         stood_s = max(dt, link.decision_age_s())
         if before is not None and (own.hung or stood_s > config.watchdog_s):
             observed = dataclasses.replace(observed, stalled_s=max(stood_s, config.watchdog_s))
-            if stood_s > max(config.watchdog_s, config.max_state_gap_s) and not observed.jumped:
+            # Until its time-out the autopilot has flown the last setpoint, whose coast was judged.
+            timeout_s = min(seen.autopilot.timeout_s(seen.loss_settings), config.max_control_timeout_s or math.inf, 0.5)
+            if stood_s > max(config.watchdog_s, timeout_s) and not observed.jumped:
                 observed = dataclasses.replace(observed, disturbance=stalled_condition(observed))
         return observed, dt
 
@@ -271,6 +275,7 @@ def _subject(estimate: SubjectEstimate, offset: np.ndarray, motion: Motion, by_s
         contradicted=estimate.contradicted or (by_size is not None and by_size.contradicted),
         sd_m=estimate.position_sd_m,
         nearer=estimate.nearer,
+        heading_error=estimate.heading_error,
         ground=Height(estimate.ground.m + float(offset[2]), estimate.ground.sd_m),
         distance_m=distance if by_size is None else min(distance, by_size.farthest_m),
         closing_m_s=-float(sight @ motion.velocity[:2]) / max(distance, 1e-3),

@@ -89,7 +89,10 @@ def _problems(
     """Why vehicle and place forbid motion, and the first cause of all that no orbit may begin."""
     vehicle = vehicle_condition(seen, config)
     place = None if vehicle else limit_condition(seen, _fence(state), config)
-    return vehicle, place, vehicle or place or subject_condition(seen, config) or start_condition(seen)
+    problem = vehicle or place or subject_condition(seen, config) or start_condition(seen)
+    if problem is None and seen.subject.position is not None:  # the fence of the next orbit is around him
+        problem = limit_condition(seen, seen.subject.position[:2], config)
+    return vehicle, place, problem
 
 
 def _fence(state: SafetyState) -> np.ndarray | None:

@@ -103,7 +103,8 @@ class FlownOrbit:
         """The setpoint of the reference ``dt`` s of its time later."""
         scene = self._scene(seen, framing)
         self._reference = advance(reference, self.goal, scene, dt, self._config)
-        return setpoint_of(self._reference, scene, self._config)
+        planned = setpoint_of(self._reference, scene, self._config)
+        return planned._replace(yaw=planned.yaw + seen.subject.heading_error)  # the autopilot flies by its own heading
 
     def limited(self, planned: Setpoint, seen: Observed, pace: Pace) -> Setpoint:
         """The setpoint at this pace, with what a vehicle behind a walker lacks, bounded towards the subject."""

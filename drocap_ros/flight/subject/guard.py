@@ -25,55 +25,93 @@ from drocap_ros.flight.vehicle import CameraPose
 from drocap_ros.keypoints import PoseObservation
 from drocap_ros.stamps import NS
 
-_LEAST_RESIDUAL_M2 = 0.05**2  # a body that stands sways: residuals that are smaller are chance
-#: Spread of the directions, as of an arc of 45 degrees (a whole circle has 1), below which they show nothing: the noise
-#: of bearings looks like a small arc, and a range that changes before a vehicle that hovers like any scale.
-_LEAST_SPREAD = 0.05
+#: Of the error that pictures have in common beside range and heading: least and first standard deviation, m, and how
+#: long it lasts: the vehicle's position errs by 0.26 m at worst, and recorded errors halve within 2 s.
+_LEAST_M, _FIRST_M, _LASTS_S = 0.05, 0.3, 5.0
+_SCALE_S, _HEADING_S = 60.0, 20.0  # within which both errors wander
+#: rad/s, rad per root of a second: of the gyroscope's rate, its scale included, and of its sum.
+_GYRO, _GYRO_WALK = math.radians(0.5), math.radians(0.5)
+_MOST_RAD = math.radians(40.0)
 
 
 class Parallax:
-    """Sums over pictures of one subject who stands; ``scale`` multiplies a measured range.
+    """The place of one subject who stands, and what is wrong alike in all pictures of him: a Kalman filter.
 
-    size_error : standard deviation of the range by body size, as a share: what is believed before the vehicle moves
+    The vehicle's own way about him shows both.  How the error of the heading changes is known: by as much as the
+    reported heading turns beyond the rates of the gyroscope, less an error of these.
+
+    scale : multiplies a measured range
+    heading : rad, reported less true
+    size_error, heading_sd : standard deviations of both: what is believed before the vehicle moves
     """
 
-    def __init__(self, size_error: float) -> None:
-        self._size_error = size_error
-        self.scale = self._prior = 1.0
-        self._seconds = 0.0
-        self._sums: np.ndarray = np.zeros(7)  # place (2), direction (2), place.place, place.direction, range: by time
+    def __init__(self, size_error: float, heading_sd: float) -> None:
+        self._usual = np.array([size_error, heading_sd])
+        self._state = np.array([0.0, 0.0, 1.0, 0.0, 0.0])  # place, scale, heading, error of the gyroscope
+        self._covariance = np.diag([0.0, 0.0, size_error**2, heading_sd**2, _GYRO**2])
+        self._noise = _FIRST_M**2
+
+    @property
+    def scale(self) -> float:
+        """Factor of a measured range."""
+        return float(self._state[2])
+
+    @property
+    def heading(self) -> float:
+        """rad, reported less true."""
+        return float(self._state[3])
+
+    def lose(self) -> None:
+        """Forget the place."""
+        self._covariance[:2], self._covariance[:, :2] = 0.0, 0.0
+
+    def corrected(self, sight: np.ndarray) -> np.ndarray:
+        """(2,) or (3,) m, from the camera to the subject as measured, without both errors."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        turned = np.array([c * sight[0] + s * sight[1], c * sight[1] - s * sight[0], *sight[2:]])
+        return self.scale * turned
+
+    def turn(self, seconds: float, turned: float) -> None:
+        """Move on in time; ``turned`` : rad, of the reported heading beyond the gyroscope's."""
+        fade, (size_error, _) = math.exp(-seconds / _SCALE_S), self._usual
+        move = np.diag([1.0, 1.0, fade, 1.0, 1.0])
+        move[3, 4] = seconds
+        self._state = move @ self._state + [0.0, 0.0, 1.0 - fade, turned, 0.0]
+        self._covariance = move @ self._covariance @ move.T
+        self._covariance[2, 2] += (1.0 - fade**2) * size_error**2
+        self._covariance[3, 3] += seconds * _GYRO_WALK**2
 
     def take(self, place: np.ndarray, sight: np.ndarray, seconds: float, speed_m_s: float) -> None:
-        """Take a picture; the faster the subject, the sooner the ones before count no more, and the scale stays.
+        """Take a picture; the faster the subject, the less is left of his place.
 
         place : (2,) m, of the camera in the map frame
-        sight : (2,) m, from there to the subject as measured, without this scale
+        sight : (2,) m, from there to the subject as measured
         seconds : since the picture before
         speed_m_s : of the subject as estimated; of one who stands it errs by 0.5 m/s, and by 1 m/s for a moment
         """
-        # The way of one who walks at 0.9 m/s is no error of the range: a second of it is forgotten.
-        kept = math.exp(-seconds * (speed_m_s / 0.9) ** 8)
-        self._prior = self.scale + kept * (self._prior - self.scale)
-        # An orbit of 11 deg/s takes 33 s; the height of the worse autopilot wanders for longer.
-        fade = kept * math.exp(-seconds / 30.0)
-        self._seconds = fade * self._seconds + seconds
-        distance = float(np.hypot(*sight))
-        toward = sight / max(distance, 1e-3)
-        news = np.concatenate([place, toward, [place @ place, place @ toward, distance]])
-        self._sums = fade * self._sums + seconds * news
-        mean = self._sums / self._seconds
-        places, both = mean[4:6] - mean[:2] @ np.stack([mean[:2], mean[2:4]], axis=1)
-        spread = 1.0 - float(mean[2:4] @ mean[2:4])
-        # place + radius * direction = the subject's place: least squares with his place free.
-        radius = -both / max(spread, _LEAST_SPREAD)
-        residual = max(places - radius**2 * spread, _LEAST_RESIDUAL_M2)
-        known, measured = self._size_error**-2, float(mean[6])
-        # Errors of the vehicle's position last for less than 5 s: recorded ones of both autopilots halve within 2 s.
-        shown = self._seconds / 5.0 * measured**2 * max(spread - _LEAST_SPREAD, 0.0) / residual
-        scale = (known * self._prior + shown * radius / max(measured, 1e-3)) / (known + shown)
-        # Two standard deviations of the range by body size.
-        most = 2.0 * self._size_error
-        self.scale = float(min(max(scale, 1.0 - most), 1.0 + most))
+        seen = self.corrected(sight)
+        if self._covariance[0, 0] == 0.0:
+            self._state[:2], self._covariance[[0, 1], [0, 1]] = place + seen, 1e4
+        # The way of one who walks at 0.9 m/s is no error of range and heading: 1 m in a second.
+        walked_m2 = seconds * min(speed_m_s / 0.9, 2.0) ** 12 if speed_m_s > 0.5 else 0.0
+        self._covariance[[0, 1], [0, 1]] += walked_m2
+        expected, (scale, heading) = self._state[:2] - place, self._state[2:4]
+        # Between both: the noise of what is seen would shrink the scale, and that of the place stretch it.
+        middle, off = 0.5 * (expected + seen), np.array([*(expected - seen), -heading])
+        show = np.zeros((3, 5))
+        show[:2, :2], show[2, 3] = -np.eye(2), 1.0
+        show[:2, 2], show[:2, 3] = middle / scale, [middle[1], -middle[0]]
+        # The heading returns within its time.
+        noise = [self._noise * _LASTS_S] * 2 + [self._usual[1] ** 2 * 2.0 * _HEADING_S]
+        spread = show @ self._covariance @ show.T + np.diag(noise) / max(seconds, 1e-3)
+        gain = np.linalg.solve(spread, show @ self._covariance).T
+        self._state = self._state + gain @ off
+        covariance = self._covariance - gain @ show @ self._covariance
+        self._covariance = 0.5 * (covariance + covariance.T)
+        share = 1.0 - math.exp(-seconds / 10.0)
+        self._noise = max(self._noise + share * (0.5 * float(off[:2] @ off[:2]) - self._noise), _LEAST_M**2)
+        most = 2.0 * self._usual[0]  # two standard deviations of the range by body size
+        self._state[2:4] = np.clip(self._state[2:4], [1.0 - most, -_MOST_RAD], [1.0 + most, _MOST_RAD])
 
 
 _BEARING_NOISE = 0.01  # share of the range

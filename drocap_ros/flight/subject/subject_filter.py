@@ -39,6 +39,7 @@ class SubjectEstimate:
     contradicted : whether an image since then showed another track, or a subject where this one cannot be
     nearer : share of his distance from the camera by which the nearer of body size and ground puts him nearer
     ground : his ground by his body alone, over the last seconds
+    heading_error : rad, of the vehicle's heading, reported less true
     """
 
     position: np.ndarray
@@ -51,6 +52,7 @@ class SubjectEstimate:
     contradicted: bool = False
     nearer: float = 0.0
     ground: Height = NO_HEIGHT
+    heading_error: float = 0.0
 
 
 def _range_noise(
@@ -90,7 +92,10 @@ class SubjectFilter:
         self._contradicted = False
         self._ground, self._grounds = NO_HEIGHT, deque[tuple[int, float]]()
         self._nearer = 0.0
-        self._parallax = Parallax(config.size_error)
+        #: rad, of the reported heading.
+        self.heading_sd = math.radians(config.attitude_error_deg)
+        self._parallax = Parallax(config.size_error, self.heading_sd)
+        self._turned = 0, 0.0  # stamp of the last picture, and what the heading had turned there
 
     def update(
         self,
@@ -109,9 +114,10 @@ class SubjectFilter:
         measured = locate_subject(observation, camera_matrix, camera, self._config, self._ground)
         if measured is None:
             return False
-        sight = measured.position - camera.position
-        measurement = measured._replace(position=camera.position + self._parallax.scale * sight)
         gap_s = (observation.stamp_ns - self._stamp_ns) / NS
+        self._turn(observation.stamp_ns, camera.turned)
+        sight = measured.position - camera.position
+        measurement = measured._replace(position=camera.position + self._parallax.corrected(sight))
         other = observation.track_id != self._track_id
         strange = self._state is None or other
         if strange if locked else strange or abs(gap_s) > 2.0:
@@ -144,6 +150,13 @@ class SubjectFilter:
             self._start(observation, measurement)
         return not locked
 
+    def _turn(self, stamp_ns: int, turned: float) -> None:
+        """The heading's error moves on from picture to picture."""
+        before_ns, before = self._turned
+        self._turned = stamp_ns, turned
+        if 0 < stamp_ns - before_ns < 5 * NS:
+            self._parallax.turn((stamp_ns - before_ns) / NS, turned - before)
+
     def estimate(self, now_ns: int) -> SubjectEstimate | None:
         """The subject predicted to ``now_ns`` (half a second at most); None before the first measurement."""
         if self._state is None:
@@ -162,6 +175,7 @@ class SubjectFilter:
             contradicted=self._contradicted,
             nearer=self._nearer,
             ground=self._ground,
+            heading_error=self._parallax.heading,
         )
 
     def _learn_ground(self, measurement: SubjectMeasurement, stamp_ns: int) -> None:
@@ -188,7 +202,8 @@ class SubjectFilter:
         if observation.track_id != self._track_id:  # another person
             self._grounds.clear()
             self._ground = NO_HEIGHT
-            self._parallax = Parallax(self._config.size_error)
+            self._parallax = Parallax(self._config.size_error, self.heading_sd)
+        self._parallax.lose()
         self._stamp_ns, self._track_id = observation.stamp_ns, observation.track_id
         self._contradicted = False
         self._learn_ground(measurement, observation.stamp_ns)

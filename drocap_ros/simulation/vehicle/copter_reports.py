@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.flight.autopilot.autopilot import Airframe, ReportErrors
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.flight.vehicle import enu_to_ned
-from drocap_ros.geometry.rotations import quaternion_multiply
+from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_multiply
 from drocap_ros.simulation.vehicle.flight_control import FlightControl, control_of
 from drocap_ros.simulation.vehicle.mavlink_vehicle import ESTIMATOR_HEALTHY, Encode, SimulatedVehicle, VehiclePose
 from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
@@ -150,6 +150,7 @@ class Body:
 
 
 EKF_NOTICED_S = 7.4  # from the loss of satellites to the estimator's report: measured
+_GYRO = np.array([math.radians(0.3), 0.01, math.radians(0.6)])  # offset, scale and noise, rad/s: assumed
 _CONSTANT_POSITION = ESTIMATOR_HEALTHY & ~(8 | 16) | 128
 _NO_POSITION = 1 | 2 | 4  # POSITION_TARGET_TYPEMASK
 _NO_YAW = 1024 | 2048  # POSITION_TARGET_TYPEMASK: neither yaw nor its rate
@@ -162,6 +163,7 @@ class CopterSetup(NamedTuple):
     wind : (3,) m/s
     estimate_error : of the estimate, as a share of the recorded ones
     yaw_error_deg : standard deviation of the heading's error, which wanders within 20 s; PX4's was 4 to 19 at worst
+    gyro_error : of the rate of yaw, as a share of 0.3 deg/s, 1 % and a noise of 0.6 deg/s
     timeout_s : its own time-out without setpoints
     mode : at first; "" = that of the sticks
     mount : of the camera; None = a gimbal, level
@@ -174,6 +176,7 @@ class CopterSetup(NamedTuple):
     estimate_error: float = 1.0
     attitude_error_deg: float = 0.4
     yaw_error_deg: float = 0.0
+    gyro_error: float = 1.0
     timeout_s: float = 0.5
     mode: str = "LOITER"
     mount: SimulatedMount | None = None
@@ -203,6 +206,9 @@ class ReportingCopter(SimulatedVehicle):
         lean = np.array([*(0.5 * self._attitude_error[:2]), 0.0, 1.0])
         self._lean_error = lean / np.linalg.norm(lean)
         self.error.yaw_sd = math.radians(setup.yaw_error_deg)
+        self._gyro_rng = np.random.default_rng([setup.seed, 0xC4])
+        self._gyro_sd = setup.gyro_error * _GYRO
+        self._gyro_error = self._gyro_sd * self._gyro_rng.standard_normal(3)
         self._report: VehiclePose | None = None
         self._report_s = -1.0
 
@@ -229,12 +235,15 @@ class ReportingCopter(SimulatedVehicle):
             return self._report
         self._report_s = t_s
         body = self.body.orientation_xyzw()
+        offset, scale, _ = self._gyro_error
+        rate = self.body.yaw_rate * (1.0 + scale) + offset + self._gyro_sd[2] * self._gyro_rng.standard_normal()
         turn = np.array([0.0, 0.0, math.sin(0.5 * self.error.yaw), math.cos(0.5 * self.error.yaw)])
+        reported = quaternion_multiply(quaternion_multiply(turn, body), self._lean_error)
         self._report = VehiclePose(
             self.estimate,
             self.body.velocity + self.error.velocity,
-            quaternion_multiply(quaternion_multiply(turn, body), self._lean_error),
-            np.array([0.0, 0.0, self.body.yaw_rate]),
+            reported,
+            rate * matrix_from_quaternion(reported)[2],  # about the vertical alone
             self.mount.camera(body),
         )
         return self._report

@@ -298,9 +298,9 @@ def test_mutated_and_random_bytes_raise_nothing(port):
     out.close()
 
 
-@pytest.mark.parametrize("component", [100, 154, 191, 25])
+@pytest.mark.parametrize("component", [100, 154, 191, 25, 1])
 def test_setpoints_go_to_the_autopilot_whoever_else_of_its_system_talks_from_another_port(port, component):
-    """A camera, a gimbal, a companion, a servo: each sends before, between and after the autopilot's messages."""
+    """A camera, a gimbal, a companion, a servo, a program with its own ids: each sends between its messages."""
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", commands_enabled=True)
     theirs = mavlink.MAVLink(None, srcSystem=1, srcComponent=component)
     autopilots = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)

@@ -37,7 +37,7 @@ def fly(
 
     place : north (m) of the vehicle at a time; None = at the setpoint
     """
-    following, sent, echoed = Following(MAX_ECHO_AGE_S), [], None
+    following, sent, echoed = Following(MAX_ECHO_AGE_S, 0.2), [], None
     for i in range(1, round(seconds * 20)):
         t = i / 20
         x = commanded * t
@@ -126,7 +126,7 @@ def test_a_vehicle_that_stands_where_velocity_and_way_back_cancel_follows():
 
 
 def test_each_orbit_is_judged_anew():
-    following = Following(MAX_ECHO_AGE_S)
+    following = Following(MAX_ECHO_AGE_S, 0.2)
     sent = [(0.05 * i, setpoint(0.1 * i, 2.0)) for i in range(60)]
     slow = vehicle("ardupilot", 0.0)
     assert following.step(3.0, 3.0, Echoes(sent, (0.1, setpoint(6.0, 2.0))), slow) == ""
@@ -168,7 +168,7 @@ def test_no_recorded_flight_of_a_real_autopilot_counts_as_standing(shared):
         if not path.name.startswith(("orbit", "px4_stand", "px4_walk")):
             continue
         flight = dict(np.load(path))
-        following, time = Following(MAX_ECHO_AGE_S), flight["time_s"]
+        following, time = Following(MAX_ECHO_AGE_S, 0.2), flight["time_s"]
         sent = np.hstack([flight["setpoint_position_m"][:, :2], flight["setpoint_velocity_m_s"][:, :2]])
         for at, (east, north, ve, vn) in zip(flight["setpoint_time_s"], sent, strict=True):
             flown, place = (

@@ -36,6 +36,15 @@ def test_an_orbit_about_one_who_stands_lasts_and_his_place_stays(autopilot, seed
     assert np.hypot(*(seconds - seconds.mean(axis=0)).T).max() < 1.2  # he was believed 4.6 m away from his place
 
 
+@pytest.mark.parametrize(("seed", "yaw_error_deg", "gyro_error"), [(2, 6.0, 1.0), (1, 15.0, 1.0), (7, 6.0, 5.0)])
+def test_the_place_of_one_who_stands_is_known_by_a_heading_that_wanders(seed, yaw_error_deg, gyro_error):
+    """PX4's errs by 4 to 19 degrees: he was believed 1.6 m from his place, and 4 m by an error of 15 degrees."""
+    loop, places = flown("px4", seed, 48.0, yaw_error_deg=yaw_error_deg, gyro_error=gyro_error)
+    assert {row.state for row in loop.rows if row.t_s > 8.0} == {State.ORBITING}, loop.reasons[-2:]
+    assert np.hypot(*places.T).max() < (0.8 if gyro_error == 1.0 else 1.6)
+    assert orbit_quality(loop, 6.0, 13.0).radius_error_m < 0.4
+
+
 def test_an_orbit_about_one_who_walks_lasts():
     loop, _ = flown("px4", 1, action="walk")
     assert {row.state for row in loop.rows if row.t_s > 8.0} == {State.ORBITING}, loop.reasons[-2:]

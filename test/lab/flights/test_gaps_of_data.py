@@ -170,3 +170,26 @@ def test_a_fixed_wing_is_not_commanded(autopilot):
     assert all(row.action == Action.NOTHING for row in loop.rows)
     assert loop.status.condition.code == ConditionCode.AUTOPILOT_UNSUPPORTED
     assert f"{autopilot}, vehicle type 1" in loop.status.reason
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_an_orbit_on_a_busy_machine_ends_by_no_short_stand_of_our_own(autopilot):
+    """Process and loop stand still as at a load of 40: 0.1 s a second, every twentieth of them for 0.3 s and more.
+
+    Old data that waited to be read, and the echo of the guardian's hold, ended an orbit too."""
+    for seed in range(3):
+        loop = OrbitLoop(LoopSettings(autopilot=autopilot, seed=seed, seconds=61, load=40.0, latency_s=0.06))
+        stands, before = [], [0.0]
+
+        def step(loop, stands=stands, before=before):
+            if not (loop.hung or loop.stopped):
+                stands.append(loop.t - before[0])
+                before[0] = loop.t
+
+        loop.start()
+        loop.run(60.0, step)
+        assert max(stands) > 0.3
+        ends = [(t, reason.code) for t, state, reason in loop.reasons if t > 4.5 and state == "HOLDING"]
+        ended_s = min((t for t, _ in ends), default=60.0)
+        longest = max(s for s, at in zip(stands, np.cumsum(stands), strict=True) if at < ended_s + 0.1)
+        assert not ends or (ends[0][1] == ConditionCode.CONTROL_LOOP_STALLED and longest > 0.5), (ends, longest)
