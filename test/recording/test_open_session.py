@@ -156,8 +156,8 @@ def test_topic_of_an_unknown_type_is_listed_and_readable(tmp_path, messages, cap
 
 def test_topic_with_most_messages_is_read(tmp_path, messages, capture):
     tracks = capture.tracks
-    entries = [("/a/pose2d", messages.pose2d(tracks, i, START_NS + i), START_NS + i) for i in range(3)]
-    entries += [("/b/pose2d", messages.pose2d(tracks, i, START_NS + i), START_NS + i) for i in range(5)]
+    entries = [("/a/pose2d", messages.pose2d(tracks, i, START_NS + i * 10**7), START_NS + i) for i in range(3)]
+    entries += [("/b/pose2d", messages.pose2d(tracks, i, START_NS + i * 10**7), START_NS + i) for i in range(5)]
     record(tmp_path / "s", [(t, m, s, messages.cdr(m)) for t, m, s in entries])
     with open_session(tmp_path / "s") as session:
         assert len(read_pose2d(session)) == 5

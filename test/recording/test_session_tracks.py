@@ -390,11 +390,11 @@ def test_the_distortion_and_the_projection_of_a_camera_info_are_used(tmp_path, m
 def test_poses_are_sorted_and_repeated_ones_left_out(tmp_path, messages, capture):
     tracks = capture.tracks
     order = [3, 1, 2, 0, 2]
-    entries = [("/pose2d", messages.pose2d(tracks, i, START_NS + i), START_NS + k) for k, i in enumerate(order)]
+    entries = [("/pose2d", messages.pose2d(tracks, i, START_NS + i * 10**7), START_NS + k) for k, i in enumerate(order)]
     record(tmp_path / "s", [(t, m, s, messages.cdr(m)) for t, m, s in entries])
     with open_session(tmp_path / "s") as session:
         read = read_pose2d(session)
-        assert np.array_equal(read.stamp_ns, START_NS + np.arange(4))
+        assert np.array_equal(read.stamp_ns, START_NS + np.arange(4) * 10**7)
         assert np.array_equal(read.keypoints, tracks.keypoints[:4].astype(np.float32), equal_nan=True)
         assert any("repeated poses" in warning for warning in session.warnings)
 
