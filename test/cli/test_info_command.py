@@ -85,7 +85,8 @@ def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, cap
 def test_a_motion_of_impossible_values_is_refused(tmp_path, capsys, change, words):
     arrays = {
         "joints3d": np.zeros((2, 15, 3)), "joints": BODY_15.joints, "parents": BODY_15.parents, "frame": "camera",
-        "stamp_ns": np.arange(2) * 40_000_000, "metric": False, "scale_source": "", "camera_rotation": np.zeros((2, 3, 3)),
+        "stamp_ns": np.arange(2) * 40_000_000, "metric": False, "scale_source": "",
+        "camera_rotation": np.zeros((2, 3, 3)),
         "confidence": np.ones((2, 15)), "keypoints": np.ones((2, 15, 2)), "reprojection_px": np.ones((2, 15)),
         "meta": "{}",
     }  # fmt: skip
