@@ -53,8 +53,11 @@ class Hand:
             " const r = e.getBoundingClientRect(); return [r.x, r.y, r.width, r.height]; })()"
         )
         wait(lambda: (box := self.browser.run(found)) and box[2] > 0, selector)
-        time.sleep(0.3)  # scrolling and animations end
-        x, y, width, height = self.browser.run(found)
+        before: list[float] = []
+        while (box := self.browser.run(found)) != before:  # scrolling, and what the page adds on a busy machine, end
+            before = box
+            time.sleep(0.3)
+        x, y, width, height = box
         return x, y, width, height
 
     def drag(self, selector: str, begin: tuple[float, float], end: tuple[float, float]) -> None:
@@ -132,8 +135,11 @@ def corrections_of(folder: Path) -> str:
 
 
 def solve(hand: Hand, motion: Path) -> None:
-    before = motion.stat().st_mtime_ns
-    hand.press("Solve again")
+    before, pressed, end = motion.stat().st_mtime_ns, hand.clicks + 1, time.monotonic() + PATIENCE_S
+    while idle(hand) and motion.stat().st_mtime_ns == before and time.monotonic() < end:
+        hand.press("Solve again")  # a click that follows a drag at once is lost at times: a hand clicks again
+        time.sleep(5.0)
+    hand.clicks = pressed
     wait(lambda: motion.stat().st_mtime_ns != before and idle(hand), "another solution")
 
 
