@@ -51,6 +51,6 @@ class Desk:
 
 
 def tell(words: str, kind: Literal["warning", "negative"] = "warning") -> None:
-    """Say something beside the work; what went wrong stays until it has been read."""
-    last = 0 if kind == "negative" else 6000
-    ui.notify(words, type=kind, position="bottom-left", multi_line=True, close_button="Close", timeout=last)
+    """Say something over the side, which covers no control of the work; what went wrong stays until it is read."""
+    ui.notify(words, type=kind, position="bottom-left", multi_line=True, close_button="Close", classes="told",
+              timeout=0 if kind == "negative" else 6000)  # fmt: skip

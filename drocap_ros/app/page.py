@@ -173,6 +173,7 @@ _STYLE = """
 .desk { display: grid; grid-template-columns: minmax(260px, 340px) 1fr; width: 100%; min-height: calc(100vh - 52px); }
 .desk .side { padding: 12px; border-right: 1px solid #8884; overflow: auto; max-height: calc(100vh - 52px); }
 .desk .main { padding: 0 12px 12px; min-width: 0; }
+.told { max-width: 320px; overflow-wrap: anywhere; }
 .chosen { outline: 2px solid var(--q-primary); }
 .timeline { height: 84px; aspect-ratio: auto !important; }
 .thumb { width: 64px; height: 64px; object-fit: cover; border-radius: 4px; background: #8883; }
