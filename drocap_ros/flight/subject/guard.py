@@ -93,7 +93,7 @@ class Parallax:
         if self._covariance[0, 0] == 0.0:
             self._state[:2], self._covariance[[0, 1], [0, 1]] = place + seen, 1e4
         # The way of one who walks at 0.9 m/s is no error of range and heading: 1 m in a second.
-        walked_m2 = seconds * min(speed_m_s / 0.9, 2.0) ** 12 if speed_m_s > 0.5 else 0.0
+        walked_m2 = seconds * min(speed_m_s / 0.9, 2.0) ** 12
         self._covariance[[0, 1], [0, 1]] += walked_m2
         expected, (scale, heading) = self._state[:2] - place, self._state[2:4]
         # Between both: the noise of what is seen would shrink the scale, and that of the place stretch it.
