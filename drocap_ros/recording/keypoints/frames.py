@@ -92,13 +92,16 @@ def followed(people: list[tuple[int, Label, np.ndarray]]) -> list[tuple[int, Lab
         by_frame.setdefault(frame, []).append((who, points))
     found: list[tuple[int, Label, np.ndarray]] = []
     for frame in sorted(by_frame):
-        pairs = []
+        pairs, here = [], {who for who, _ in by_frame[frame]}
+        known = {own: was for own, was in last.items() if frame - was[0] - 1 <= _LOST or was[1] in here}
         for i, (who, points) in enumerate(by_frame[frame]):
-            for own, (before, theirs, old) in last.items():
+            for own, (before, theirs, old) in sorted(known.items(), key=lambda item: item[1][1] != who):
                 step, missed = _step(old, points), frame - before - 1
                 near = step <= (_OWN_STEP if who == theirs else _OTHER_STEP) * (1 + 0.1 * missed) and missed <= _LOST
                 rank = 0 if who == theirs and near else 1 if near else 2
                 pairs += [(rank, step, i, own)] * (near or who == theirs)
+                if rank == 0:
+                    break
         chosen: dict[int, Label] = {}
         for _, _, i, own in sorted(pairs, key=lambda pair: pair[:3]):
             if i not in chosen and own not in chosen.values():

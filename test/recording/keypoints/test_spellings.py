@@ -10,6 +10,7 @@ from test_keypoint_files import SIZE, flat, rows, text, walk, write
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
+from drocap_ros.recording.keypoints import frames
 from drocap_ros.recording.keypoints.files import Stated, is_keypoint_file, read_keypoints
 from drocap_ros.skeleton import COCO_17
 
@@ -380,3 +381,13 @@ def test_a_body_is_told_from_hands_and_a_face(tmp_path, first, names):
         nodes.append(parts if first else dict(reversed(parts.items())))
     found = read_keypoints(write(tmp_path / "k.json", nodes), Stated(30.0, SIZE))
     assert np.abs(found.keypoints - xy[:, : found.keypoints.shape[1]]).max() < 0.01
+
+
+def test_a_long_file_of_ever_new_numbers_is_compared_with_those_of_its_time_alone(monkeypatch):
+    rng, count = np.random.default_rng(0), []
+    step = frames._step
+    monkeypatch.setattr(frames, "_step", lambda old, new: (count.append(0), step(old, new))[1])
+    places = rng.uniform(0, 2000, (300, 1, 4))
+    people = [(f, f // 5, places[f // 5] + rng.normal(0, 20, (17, 4))) for f in range(1500)]
+    assert len(frames.followed(people)) == len(people)
+    assert len(count) < 12 * len(people)  # of 300 persons
